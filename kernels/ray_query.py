@@ -87,7 +87,9 @@ def traversal_ray(ray: QueryRay, is_other: bool) -> Ray:
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if is_other or inexact():
         warn_once(wp.where(is_other, 1, 0))
-        out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+        out.direction = wp.vec3(1.0, 1.0, 1.0)  # not NaN, which fast maths does not compare as false
+        out.t_min = 0.0
+        out.t_max = -1.0
     return out
 
 

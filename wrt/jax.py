@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.geometry import Geometry
 from wrt.accel.queries.gradients import Cotangents, adjoint
-from wrt.accel.tensors import HitTensors, hits_of, library
+from wrt.accel.queries.rays import from_origin
+from wrt.accel.tensors import HitTensors, at_vertices, hits_of, library
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
 
@@ -59,7 +59,7 @@ def _function() -> Any:
     def closest_hit(accel: OneMesh, rebuild_at: float, vertices: Any, *rays: Any) -> HitTensors:
         def query(vertices: Any, *rays: Any) -> HitTensors:
             hits = hits_of(accel, vertices, rays, rebuild_at)
-            return HitTensors(hits.t, hits.u, hits.v, hits.point, hits.prim_id)
+            return HitTensors(hits.t, hits.u, hits.v, hits.point.astype(np.float32), hits.prim_id)
 
         n = len(rays[0])
         one, three, index = (jax.ShapeDtypeStruct(*each) for each in (((n,), np.float32), ((n, 3), np.float32), ((n,), np.int32)))
@@ -77,8 +77,9 @@ def _function() -> Any:
             vertices, origins, directions = inputs
             geometry = accel.geometry
             if vertices is not None:
-                geometry = Geometry(vertices.astype(np.float32), geometry.faces, geometry.spheres)
-            found = adjoint(geometry, origins, directions, prim_id, Cotangents(*cotangents))
+                geometry = at_vertices(geometry, vertices)
+            near = from_origin(origins.astype(np.float64), geometry.origin)
+            found = adjoint(geometry, near, directions, prim_id, Cotangents(*cotangents))
             return tuple(x if x is None else each.astype(x.dtype) for each, x in zip(found, inputs, strict=True))
 
         shapes = jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape, each.dtype), inputs)

@@ -9,7 +9,9 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
+from wrt.accel.queries.rays import from_origin
 from wrt.accel.tensors import HitTensors, hits_of, library
+from wrt.core.arrays import to_numpy
 from wrt.core.types import ArrayLike
 
 if TYPE_CHECKING:
@@ -53,8 +55,11 @@ def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, dir
 def _function() -> Any:  # a subclass of torch.autograd.Function
     torch = library("torch")
 
+    def as_it_is_on_cpu(each: Any) -> Any:  # far from 0, float64 counts
+        return each if each.dtype == torch.float64 and each.device.type == "cpu" else each.float()
+
     def forward(ctx: Any, accel: OneMesh, rebuild_at: float, t_min: Any, t_max: Any, *inputs: Any) -> tuple[Any, ...]:
-        vertices, *rays = (each if each is None else each.detach().float().contiguous() for each in inputs)
+        vertices, *rays = (each if each is None else as_it_is_on_cpu(each).detach().contiguous() for each in inputs)
         hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
         ctx.geometry = hits.source[0].mesh  # type: ignore[index]
         ctx.input_types = [each if each is None else (each.device, each.dtype) for each in inputs]
@@ -65,6 +70,7 @@ def _function() -> Any:  # a subclass of torch.autograd.Function
 
     def backward(ctx: Any, *cotangents: Any) -> tuple[Any, ...]:
         origins, directions, prim_id = ctx.saved_tensors
+        origins = from_origin(to_numpy(origins), ctx.geometry.origin)
         gradients = adjoint(ctx.geometry, origins, directions, prim_id, Cotangents(*cotangents[:4]))
         typed = zip(gradients, ctx.input_types, strict=True)
         return None, None, None, None, *(kind and torch.from_numpy(each).to(*kind) for each, kind in typed)

@@ -60,3 +60,19 @@ def test_arrays_in_arrays_out() -> None:
     np.testing.assert_array_equal(hits.t, accel.closest_hit(np.asarray(o), np.asarray(d)).t)
     with pytest.raises(InputError, match=r"origins: .*wrt.jax"):
         jax.jit(lambda o: accel.closest_hit(o, d).t)(o)
+
+
+def test_far_from_0_gradients_are_those_of_0() -> None:
+    ball, place = shapes.icosphere(3), np.float32([4096.0, 8192.0, 0.0])
+    vertices, origin, direction = (ball.vertices * 64).round() / 64, np.float32([[0.125, 0.25, 5.0]]), np.float32([[0.0, 0.125, -1.0]])
+    found = []
+    for at in (np.zeros(3, np.float32), place):  # all sums are exact
+        accel = wrt.build((np.float64(vertices) + at, ball.faces))
+        for corners in (None, vertices + at):
+
+            def loss(o: Any, d: Any, accel: Any = accel, corners: Any = corners) -> Any:
+                return wrt.jax.closest_hit(accel, corners, o, d).t.sum()
+
+            found.append(jax.grad(loss, (0, 1))(origin + at, direction))
+    for each in found[1:]:
+        np.testing.assert_allclose(np.concatenate(each), np.concatenate(found[0]), rtol=1e-5)

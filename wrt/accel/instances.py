@@ -30,7 +30,7 @@ from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import MAX_REACH, as_number, far_origin
+from wrt.scene.values import FAR_IN_A_SCENE, MAX_REACH, SMALLEST, as_number, far_origin, warn_if_alone
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -110,7 +110,7 @@ class Instances(Accelerator):
              object: ObjectId | Sequence[ObjectId] | None = None, world: ArrayLike | None = None) -> Refit:
         """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.
 
-        Where a move takes all instances far from 0, the structure's `origin` moves to them, and `world` is to be read again.
+        If a move takes all instances far from 0, `origin` moves to them; a new structure has nearly the same origin.
         Other threads may query at the same time, as during `OneMesh.refit`.
 
         Parameters
@@ -164,7 +164,7 @@ class Instances(Accelerator):
             return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def _boxed(self, geometry: InstancedGeometry, rows: np.ndarray) -> tuple[InstancedGeometry, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the geometry, the moved instances and their boxes: all instances, with another origin, if the move takes them far."""
+        """Return the geometry, the moved instances and their boxes: all instances, if their origin changes."""
         if "boxes" not in self._cache:
             self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
         low, high = world_boxes(geometry, rows, self._cache["boxes"])
@@ -172,13 +172,26 @@ class Instances(Accelerator):
             raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
         lows, highs = self._top.low.astype(np.float64), self._top.high.astype(np.float64)
         lows[rows], highs[rows] = low, high
-        some = (lows <= highs).all(axis=1) & (len(geometry.spheres) == 0)
-        if not some.any() or (far := far_origin(lows[some].min(axis=0), highs[some].max(axis=0))) is None:
+        some = (lows <= highs).all(axis=1)
+        if not some.any() or len(geometry.spheres) or not geometry.is_placed.all():  # these have no matrix of their own
             return geometry, rows, low, high
-        to_world, rows = geometry.to_world.copy(), np.arange(len(lows))
-        to_world[:, :, 3] -= far
-        geometry = replace(geometry, to_world=to_world, origin=far if geometry.origin is None else geometry.origin + far)
-        return geometry, rows, *world_boxes(geometry, rows, self._cache["boxes"])
+        for _ in range(4):  # boxes are rounded where they were: each turn is more exact
+            ends, old = (lows[some].min(axis=0), highs[some].max(axis=0)), np.zeros(3) if geometry.origin is None else geometry.origin
+            if (far := far_origin(*ends)) is not None:
+                origin: np.ndarray | None = old + far
+            elif geometry.origin is not None and far_origin(ends[0] + old, ends[1] + old) is None:
+                origin = None
+            else:
+                half = np.where(low <= high, 0.5 * (high - low), np.inf).max(axis=1)
+                for row in np.flatnonzero(np.maximum(-low, high).max(axis=1) > FAR_IN_A_SCENE * np.maximum(half, SMALLEST))[:1]:
+                    warn_if_alone(low[row], high[row], "a moved instance")
+                break
+            to_world, rows = geometry.to_world.copy(), np.arange(len(lows))
+            to_world[:, :, 3] += old - (0.0 if origin is None else origin)
+            geometry = replace(geometry, to_world=to_world, origin=origin)
+            low, high = world_boxes(geometry, rows, self._cache["boxes"])
+            lows, highs = low.astype(np.float64), high.astype(np.float64)
+        return geometry, rows, low, high
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""
@@ -237,7 +250,8 @@ def checked_moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) ->
         raise InputError(f"must be a whole number, or (R,) of them, got {shown(instance)}", argument="instance")
     matrices = real_numbers(matrix, "matrix", f"{(*rows.shape, 4, 4)}").astype(np.float64)
     if matrices.shape not in ((*rows.shape, 4, 4), (*rows.shape, 3, 4)):
-        raise InputError(f"must be {(*rows.shape, 4, 4)}, got {matrices.shape}", argument="matrix")
+        raise InputError(f"must be {(*rows.shape, 4, 4)}, got {matrices.shape}", argument="matrix",
+                         hint="wp.transform_to_matrix makes one of a transform" if matrices.shape[-1:] == (7,) else None)
     if matrices.shape[-2] == 4 and (matrices[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError("must be affine: its last row must be 0, 0, 0, 1", argument="matrix")
     ids, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)

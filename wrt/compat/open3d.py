@@ -31,7 +31,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
 from wrt.kernels.placed_rays import SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
-from wrt.scene.values import LARGEST, as_number, near_zero, type_of, warn_if_far
+from wrt.scene.values import LARGEST, as_number, near_zero, type_of, warn_if_alone, warn_if_far
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
@@ -234,6 +234,9 @@ class RaycastingScene:
                 n += len(positions)
                 warn_if_far(positions, "mesh of add_triangles")
             positions, origin = near_zero(np.concatenate(vertices) if n else np.zeros((1, 3)))
+            for each in vertices if origin is None else ():
+                if each.dtype == np.float64 and len(each):
+                    warn_if_alone(each.min(axis=0), each.max(axis=0), "mesh of add_triangles")
             mesh = Geometry(positions, np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
             ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32))
                    for i, (_, indices) in enumerate(self._meshes)]

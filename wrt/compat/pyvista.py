@@ -154,7 +154,7 @@ def to_polydata(mesh: Mesh) -> pyvista.PolyData:
     Returns
     -------
     pyvista.PolyData
-        Points (V, 3) float32 and F triangles.
+        Points (V, 3), float32 or, of a mesh with an origin, float64; and F triangles.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def to_polydata(mesh: Mesh) -> pyvista.PolyData:
     with needed_by("a mesh of PyVista"):
         import pyvista
 
-    polydata = pyvista.PolyData.from_regular_faces(mesh.vertices.copy(), mesh.faces.copy())
+    polydata = pyvista.PolyData.from_regular_faces((mesh.vertices if mesh.origin is None else mesh.positions).copy(), mesh.faces.copy())
     if mesh.normals is not None:
         polydata.point_data["Normals"] = mesh.normals.copy()
         polydata.GetPointData().SetActiveNormals("Normals")

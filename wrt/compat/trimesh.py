@@ -27,6 +27,7 @@ from wrt.core.threads import FreeList, thread_count
 from wrt.core.types import ArrayLike, WarpStruct
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
+from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh
 
 with needed_by("wrt.compat.trimesh"):
@@ -96,7 +97,8 @@ class RayMeshIntersector:
         if most < 1 or (most > 1 and len(origins) > 1):  # the hits of one ray are in order
             order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
             ray, face, u, v = (array[order] for array in (ray, face, u, v))
-        return (face, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
+        given = scaled.given(face)
+        return (given, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (given, ray)
 
     def intersects_location(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True,
                             max_hits: int = MAX_HITS) -> tuple[np.ndarray, ...]:
@@ -112,7 +114,8 @@ class RayMeshIntersector:
 
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
-        return self.scaled.closest_hits(*_rays(ray_origins, ray_directions))[3]
+        scaled = self.scaled
+        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions))[3])
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
@@ -165,8 +168,11 @@ class _ScaledStructure:
         self.shift = np.where(np.abs(used).max() > FAR * half, self.low / 2 + self.high / 2, 0.0)
         self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
         vertices[unused] = self.low
-        self.accel = build(Mesh(self.to_local(vertices), faces), device=device, threads=threads)
-        self.threads, self.vertices, self.faces = thread_count(threads), vertices, faces.astype(np.int32)
+        local = Mesh(self.to_local(vertices), faces)
+        self.faces, source = flip_collinear(local.vertices, local.faces, by_place=True)
+        self.source = None if self.faces is local.faces or np.array_equal(self.faces, local.faces) else np.append(source, -1)
+        self.accel = build(Mesh(local.vertices, self.faces), device=device, threads=threads)
+        self.threads, self.vertices = thread_count(threads), vertices
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         place: WarpStruct = Placement()
@@ -179,6 +185,10 @@ class _ScaledStructure:
     @property
     def closed(self) -> bool:
         return open_edges_of(enclosing(self.accel).snapshot) == 0
+
+    def given(self, face: np.ndarray) -> np.ndarray:
+        """Return the mesh's face for each face of the structure, where collinear faces are flipped; -1 stays."""
+        return face if self.source is None else self.source[face].astype(face.dtype)
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)

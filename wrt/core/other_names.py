@@ -25,7 +25,8 @@ OTHER_NAMES = {
     "fx": "intrinsics", "fy": "intrinsics", "K": "intrinsics", "eye": "position", "look_from": "position", "center": "target",
     "look_at": "target", "lookat": "target",
     # Of scenes.
-    "matrix": "transform", "to_world": "transform", "fov": "fov_y", "yfov": "fov_y", "color": "albedo intensity irradiance",
+    "matrix": "transform", "to_world": "transform", "fov": "fov_y intrinsics", "yfov": "fov_y intrinsics",
+    "fov_y": "intrinsics", "color": "albedo intensity irradiance",
     "indices": "faces", "points": "vertices", "load_file": "load_scene", "lambert": "diffuse", "base_color": "albedo",
     "reflectance": "albedo", "dielectric": "glass", "metal": "conductor", "lambertian": "diffuse", "principled": "metallic_roughness",
 }

@@ -89,7 +89,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         if len(raw.faces) == 0:
             raise InputError(f"has no triangles ({raw.positions} positions, {raw.incomplete} faces with fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
-    vertices, origin = (raw.vertices, raw.origin) if raw.exact or raw.origin is not None else near_zero(np.asarray(raw.vertices))
+    vertices, origin = (raw.vertices, raw.origin) if raw.exact or raw.origin is not None else near_zero(np.asarray(raw.vertices), raw.faces)
     arrays = vertices, raw.faces, raw.normals, raw.uvs, face_group
     cleaned = Cleaned(*arrays, 0) if raw.exact else clean(*arrays)
     if len(cleaned.faces) == 0:

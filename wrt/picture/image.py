@@ -265,6 +265,8 @@ def _read_exr(path: PathLike) -> tuple[np.ndarray, Sequence[float]]:
         while source.seek_subimage(len(others), 0):
             spec = source.spec()
             if names := _color_names(spec.channelnames):
+                if spec.getattribute("openexr:envmap") == 1:
+                    raise InputError("cannot be read as an image: it is a cube map", hint="exrenvmap converts it")
                 primaries, space = spec.getattribute("chromaticities", _oiio().TypeDesc("float[8]")), spec.getattribute("colorInteropID")
                 if primaries is None and space not in (None, "", "data", "unknown", "lin_rec709_scene"):
                     raise InputError(f"cannot be read as an image: its colour space is {space}", hint="use linear Rec. 709")

@@ -28,7 +28,8 @@ def read_hdr(data: bytes, most: int, decode_runs: Callable[[], np.ndarray]) -> t
 
     def numbers(name: str, count: int) -> np.ndarray:  # a row for each line of that name
         try:
-            return np.array([value.split() for key, value in lines if key == name], dtype=np.float64).reshape(-1, count)
+            rows = [value.split() for key, value in lines if key == name]
+            return np.array(rows, dtype=np.float64).reshape(len(rows), count)
         except ValueError:
             raise InputError(f"cannot be read as an image: each line {name} must hold {count} numbers") from None
     factor = (numbers("EXPOSURE", 1).prod(axis=0) * numbers("COLORCORR", 3).prod(axis=0)).astype(np.float32)
@@ -37,7 +38,10 @@ def read_hdr(data: bytes, most: int, decode_runs: Callable[[], np.ndarray]) -> t
         raise InputError("cannot be read as an image: it must have FORMAT=32-bit_rle_rgbe, GAMMA 1, and EXPOSURE and COLORCORR above 0")
     height, width, body = int(header[4]), int(header[6]), data[header.end():]
     check_size(width, height, most)
+    coded = bytes((2, 2, width >> 8 & 255, width & 255))  # begins a line with run lengths by channel
     runs = 8 <= width < 32768 and body[:2] == b"\2\2" and body[2:3] < b"\x80"
+    if 8 <= width < 32768 and not runs and any(body[first : first + 4] == coded for first in range(0, 4 * width * height, 4 * width)):
+        raise InputError("cannot be read as an image: it has lines with run lengths and lines without")
     pixels = (decode_runs() if runs else _decode(body, height * width)).reshape(height, width, 3) / factor
     by_columns = header[3] == b"X"
     pixels = pixels[:: -1 if (header[2] == b"-") == by_columns else 1, :: -1 if (header[5] == b"+") == by_columns else 1]

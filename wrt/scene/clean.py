@@ -162,7 +162,7 @@ def _split(rows: list[Any], faces: np.ndarray, with_area: np.ndarray) -> tuple[l
     return rows, parts, source, int(np.count_nonzero(gone))
 
 
-def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def flip_collinear(vertices: np.ndarray, faces: np.ndarray, by_place: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Flip the longest edge of each face with collinear corners; the surface stays the same.
 
     A collinear face (a, b, c), b between a and c, has no area, but it splits the edge from a to c in two. Without this face, its
@@ -171,8 +171,13 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
     vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). Returned face i lies in input
     face source[i], whose material and group apply to it. Faces with two equal corners stay as they are, and so do faces whose
-    longest edge does not belong to exactly two faces."""
-    return _flipped(vertices, faces, ~has_area(vertices, faces))[:2]
+    longest edge does not belong to exactly two faces. by_place: vertices at the same place are one."""
+    without = ~has_area(vertices, faces)
+    if not (by_place and without.any()):
+        return _flipped(vertices, faces, without)[:2]
+    same = merged(vertices)[faces]
+    flipped, source, _ = _flipped(vertices, same, without)
+    return np.where((flipped == same).all(axis=1)[:, None], faces, flipped).astype(faces.dtype, copy=False), source
 
 
 def _flipped(vertices: np.ndarray, faces: np.ndarray, without: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Object, Scene
-from wrt.scene.values import far_origin, shift
+from wrt.scene.values import far_origin, shift, warn_if_alone
 
 NEAR = 4.0  # an object is near 0 if it is moved by at most this multiple of its own size
 
@@ -16,9 +16,12 @@ NEAR = 4.0  # an object is near 0 if it is moved by at most this multiple of its
 def scene_origin(scene: Scene) -> np.ndarray | None:
     """Return a point, (3,) float64, near the middle of the shapes of a scene that is far from 0; None for other scenes."""
     shown = [thing for thing in scene.objects if len(thing.mesh.faces)]
-    if not all(map(_is_far, shown)) or not (shown or scene.spheres):
-        return None
-    return far_origin(*scene.bounds())
+    origin = far_origin(*scene.bounds()) if (shown or scene.spheres) and all(map(_is_far, shown)) else None
+    for thing in shown if origin is None else ():
+        if thing.mesh.origin is not None:
+            place, size = thing.placement[:3, 3], _size(thing)
+            warn_if_alone(place - size, place + size, thing.name or thing.mesh.name or "a mesh")
+    return origin
 
 
 def moved_by(scene: Scene, origin: np.ndarray | None) -> Scene:
@@ -38,5 +41,8 @@ def moved_camera(camera: CameraKind, origin: np.ndarray | None) -> CameraKind:
 
 def _is_far(thing: Object) -> bool:
     """Return whether an object may be far from 0; its mesh alone does not decide that without an origin."""
-    size = np.abs(thing.transform[:3, :3]).sum(axis=1).max() * thing.mesh.reach
-    return bool(np.abs(thing.placement[:3, 3]).max() > NEAR * size)
+    return bool(np.abs(thing.placement[:3, 3]).max() > NEAR * _size(thing))
+
+
+def _size(thing: Object) -> float:
+    return float(np.abs(thing.transform[:3, :3]).sum(axis=1).max() * thing.mesh.reach)

@@ -19,7 +19,7 @@ from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.core.write_file import write_bytes
 from wrt.scene.clean import has_area, require_indices
-from wrt.scene.values import as_vector, near_zero
+from wrt.scene.values import as_vector, near_zero, warn_if_far
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,10 +66,10 @@ class Mesh:
 
     def __post_init__(self) -> None:
         if self.origin is None:
-            with contextlib.suppress(ValueError, TypeError):
+            with contextlib.suppress(ValueError, TypeError, IndexError):
                 raw = np.asarray(self.vertices)
                 if raw.dtype.kind in "fiu" and raw.shape[1:] == (3,):
-                    near, origin = near_zero(raw)
+                    near, origin = near_zero(raw, np.asarray(self.faces, np.int64))
                     if origin is not None:
                         object.__setattr__(self, "vertices", near)
                         object.__setattr__(self, "origin", origin)
@@ -143,7 +143,8 @@ class Mesh:
         """Write vertices and faces to a file that `wrt.load_mesh` reads.
 
         .npz, .ply and .obj also have normals and uvs, and .npz has the groups. .npz keeps all bits; .obj, .off, .ply, .stl and .glb keep
-        those of the vertices. trimesh may round in other formats (.dae: seven digits).
+        those of the vertices. trimesh may round in other formats (.dae: seven digits). A mesh with an origin keeps it in .npz, .obj and
+        .off; others round positions to float32, with a warning.
 
         Parameters
         ----------
@@ -165,6 +166,8 @@ class Mesh:
             write_bytes(path, data.getvalue())
             return
         options: dict[str, Any] = {}
+        if self.origin is not None and path.suffix.lower() not in (".obj", ".off"):
+            warn_if_far(self.positions.astype(np.float32), f"{path}")
         if path.suffix.lower() in (".obj", ".off"):  # numbers without an exponent: nine digits of the smallest keep all bits of a float32
             smallest = np.abs(self.vertices).min(initial=1.0, where=self.vertices != 0.0)
             options["digits"] = 9 - math.floor(math.log10(smallest))

@@ -16,6 +16,7 @@ SMALLEST = 1e-30  # smallest length
 MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
 FAR = 32.0  # coordinates of float64 that are larger than this multiple of half their extent lose 5 bits or more in float32
 FAR_IN_FLOAT32 = 256.0  # float32 coordinates this far from 0 have lost 8 bits: a warning
+FAR_IN_A_SCENE = 2.0**14  # an object this far from the scene's 0 is rounded by a thousandth of its size: a warning
 MAX_REACH = 1e18  # largest coordinate in world space: squared distances must not overflow float32
 
 
@@ -31,12 +32,18 @@ def far_origin(low: np.ndarray, high: np.ndarray, far: float = FAR) -> np.ndarra
     return np.asarray(np.round((low / 2.0 + high / 2.0) / step) * step)
 
 
-def near_zero(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) as float32, and the origin (3,) that was subtracted from those of 8 bytes far from 0, or None."""
+def near_zero(positions: np.ndarray, faces: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions (N, 3) as float32, and the origin (3,) that was subtracted from those of 8 bytes far from 0, or None.
+
+    faces: indices of the positions that count; None: all. Raises IndexError for indices out of range."""
     origin = None
     if positions.dtype.itemsize > 4 and positions.ndim == 2 and len(positions):
         positions = positions.astype(np.float64, copy=False)
-        origin = far_origin(positions.min(axis=0), positions.max(axis=0))
+        used = np.full(len(positions), faces is None)
+        if faces is not None:
+            used[faces.reshape(-1)] = True
+        chosen = positions if used.all() else positions[used]
+        origin = far_origin(chosen.min(axis=0), chosen.max(axis=0)) if len(chosen) else None
     with np.errstate(over="ignore", invalid="ignore"):
         return (positions if origin is None else positions - origin).astype(np.float32, copy=False), origin
 
@@ -44,11 +51,19 @@ def near_zero(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 def warn_if_far(vertices: np.ndarray, name: str, origin: np.ndarray | None = None) -> None:
     """Warn if float32 vertices (V, 3) without `origin` are so far from 0 that their rounding shows. name: of the mesh."""
     if origin is None and vertices.dtype == np.float32 and len(vertices):
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        if far_origin(low, high, FAR_IN_FLOAT32) is not None:
-            reach = np.maximum(-low, high).max()
-            warn(f"{name or 'a mesh'}: its float32 vertices lie up to {reach:.6g} units from 0, where float32 has steps of"
-                 f" {np.spacing(reach):.2g} units; give them as float64, or nearer to 0")
+        _warn_of_box(vertices.min(axis=0), vertices.max(axis=0), f"{name or 'a mesh'}: its float32 vertices", FAR_IN_FLOAT32,
+                     "give them as float64, or nearer to 0")
+
+
+def warn_if_alone(low: np.ndarray, high: np.ndarray, name: str) -> None:
+    """Warn if shapes in a box (low and high, (3,)) lose digits because others of their scene lie near 0."""
+    _warn_of_box(low, high, f"{name}: its vertices", FAR_IN_A_SCENE, "other shapes lie near 0: build what lies far from them by itself")
+
+
+def _warn_of_box(low: np.ndarray, high: np.ndarray, name: str, far: float, hint: str) -> None:
+    if far_origin(low, high, far) is not None:
+        reach = np.float32(np.maximum(-low, high).max())
+        warn(f"{name} lie up to {reach:.6g} units from 0, where float32 has steps of {np.spacing(reach):.2g} units; {hint}")
 
 
 def type_of(places: np.ndarray) -> type:

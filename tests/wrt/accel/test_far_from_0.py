@@ -217,3 +217,69 @@ def test_float32_far_away_is_warned_about_once_and_near_0_nothing_changes() -> N
         wrt.build((VERTICES, FACES)).refit(far)
     assert not NEAR.origin.any() and NEAR.closest_hit(EYES, WAYS).point.dtype == np.float32
     assert np.array_equal(NEAR.geometry.vertices, np.float32(VERTICES))
+
+
+def test_unused_vertices_do_not_count(tmp_path: Path) -> None:
+    place = np.array(PLACES["UTM"])
+    vertices = np.concatenate([VERTICES + place, [[0.0, 0.0, 0.0]]])
+    (tmp_path / "far.ply").write_bytes(as_ply(vertices, FACES))
+    for mesh in ((vertices, FACES), tmp_path / "far.ply"):
+        assert wrt.build(mesh).origin.any()
+
+
+def test_what_lies_far_from_the_rest_is_told() -> None:
+    ball, place = icosphere(2), np.array(PLACES["UTM"])
+    near, far = wrt.Mesh(ball.vertices, ball.faces), wrt.Mesh(ball.vertices + place, ball.faces)
+    scene = RaycastingScene()
+    scene.add_triangles(near.vertices, near.faces)
+    scene.add_triangles(far.positions, far.faces)
+    movable = wrt.build(wrt.Scene.of([near, near]), movable=True)
+    for make in (lambda: wrt.build(wrt.Scene.of([near, far])), lambda: wrt.build([near, far]), lambda: movable.move(0, as_matrix(place)),
+                 lambda: scene.cast_rays(np.zeros((1, 6), np.float32) + [0, 0, 5, 0, 0, -1])):
+        with pytest.warns(SceneWarning, match="other shapes lie near 0"):
+            make()
+
+
+def as_matrix(place: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = place
+    return matrix
+
+
+def test_moves_of_small_and_joined_instances() -> None:
+    """The origin is as near to a small instance as to a large one, and is 0 again near 0. A joined object keeps its place."""
+    place = np.array(PLACES["Earth-centred"])
+    small = wrt.build(wrt.Mesh(0.001 * icosphere(3).vertices, icosphere(3).faces), movable=True)
+    small.move(0, as_matrix(place))
+    assert np.abs(small.origin - place).max() < 1e-4
+    small.move(0, np.eye(4))
+    assert not small.origin.any() and small.closest_hit((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)).point.dtype == np.float32
+    corner = wrt.Mesh(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.tile([[0, 1, 2]], (260_000, 1)))
+    ball = icosphere(2)
+    joined = wrt.Object(wrt.Mesh(ball.vertices + np.float32([3000, 0, 0]), ball.faces), name="joined")
+    twins = [wrt.Object(corner, transform=as_matrix(np.array([0.0, y, 0.0])), name=name) for name, y in (("a", 5.0), ("b", -5.0))]
+    accel = wrt.build(wrt.Scene((joined, *twins)))
+    accel.move(object=["a", "b"], matrix=[as_matrix(np.array([3000.0, y, 0.0])) for y in (5.0, -5.0)])
+    hits = accel.closest_hit((3000.0, 0.0, 10.0), (0.1, 0.0, -1.0))
+    assert np.allclose(hits.point, [3000.0 + 0.1 * hits.t, 0.0, 10.0 - hits.t], atol=1e-3)
+
+
+def test_point_error_bounds_the_sum_with_the_origin() -> None:
+    """At a far place, the error is that at 0 plus at most a step of float64."""
+    place = np.array(PLACES["Earth-centred"])
+    accel = wrt.build((VERTICES + place, FACES))
+    hits = accel.closest_hit(EYES + place, WAYS)
+    centred = wrt.build((accel.geometry.vertices, FACES)).closest_hit(EYES + place - accel.origin, WAYS)
+    assert np.array_equal(hits.t, centred.t)
+    added = hits.point_error[hits.hit].astype(np.float64) - centred.point_error[hits.hit]
+    assert (added > 0.0).all() and added.max() < 1e-8
+
+
+def test_files_that_round_are_told(tmp_path: Path) -> None:
+    far = wrt.Mesh(VERTICES + PLACES["UTM"], FACES)
+    for suffix in (".ply", ".stl", ".glb"):
+        with pytest.warns(SceneWarning, match="steps of 0.5 units"):
+            far.save(tmp_path / f"far{suffix}")
+    for suffix in (".npz", ".obj", ".off"):
+        far.save(tmp_path / f"far{suffix}")
+        assert np.abs(wrt.load_mesh(tmp_path / f"far{suffix}").positions - far.positions).max() < 1e-5

@@ -310,3 +310,12 @@ def test_open3d_says_the_same() -> None:
             if "ray_ids" in got and name != "ray_splits":
                 a, b = a[order[0]], b[order[1]]
             np.testing.assert_allclose(a, b, atol=2e-5) if a.dtype == np.float32 else np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_copies_of_faces_have_an_inside(turned: bool) -> None:
+    faces = np.concatenate([BOX.faces, BOX.faces[:, ::-1] if turned else BOX.faces])
+    scene = scene_of(SimpleNamespace(vertices=BOX.vertices, faces=faces))
+    points = np.float32([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0]])
+    assert scene.compute_occupancy(points).numpy().tolist() == [1.0, 0.0]
+    assert (scene.compute_signed_distance(points).numpy() < 0).tolist() == [True, False]

@@ -266,3 +266,28 @@ def test_points_stay_on_rays_along_an_axis_or_in_a_plane(move: float) -> None:
                           ray.intersects_location(origins[chosen], directions[chosen], multiple_hits=False),
                           ray.intersects_id(origins[chosen], directions[chosen], return_locations=True)[::-1]):
                 assert len(found[0]) and np.array_equal(found[0][:, fixed], origins[chosen][found[1]][:, fixed])
+
+
+JOINT = (np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 2], [1, 0, 0]], float),  # a pyramid; the last face closes a T joint
+         np.array([[0, 2, 1], [0, 3, 2], [1, 2, 4], [2, 3, 4], [3, 0, 4], [0, 5, 4], [5, 1, 4], [0, 1, 5]]))
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_joint_that_a_collinear_face_closes_loses_no_ray(shared: bool) -> None:
+    vertices, faces = JOINT if shared else (JOINT[0][JOINT[1]].reshape(-1, 3), np.arange(3 * len(JOINT[1])).reshape(-1, 3))
+    rng = np.random.default_rng(0)
+    to = np.c_[rng.random(20_000) * 2, np.zeros((20_000, 2))]
+    origins = rng.uniform(0.8, 1.2, to.shape) * [1, 1, 0.5]
+    ray = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
+    face, of = ray.intersects_id(origins, to - origins)
+    assert np.array_equal(of, np.arange(len(to))) and set(face) <= {0, 5, 6}
+    assert set(ray.intersects_first(origins, to - origins)) <= {0, 5, 6}
+    assert wrt.build(wrt.Scene.of([wrt.Mesh(vertices, faces)])).closest_hit(origins, to - origins).hit.all()
+
+
+@pytest.mark.parametrize("again", [lambda faces: faces, lambda faces: faces[:, ::-1], lambda faces: faces[:3]])
+def test_copies_of_faces_have_an_inside(again: Callable[[np.ndarray], np.ndarray]) -> None:
+    box = shapes.box()
+    mesh = trimesh.Trimesh(box.vertices, np.concatenate([box.faces, again(box.faces)]), process=False)
+    points = np.array([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0], [-0.3, 0.1, 0.0]])
+    assert RayMeshIntersector(mesh).contains_points(points).tolist() == [True, False, True]

@@ -182,7 +182,7 @@ class Hits(HitPoints[ArrayT], Suggests):
 def arrays_of(out: object) -> list[Any]:
     """Return the arrays of the argument `out` of closest_hit in the order of HIT_TYPES. Raises InputError unless it is Hits."""
     if not isinstance(out, Hits):
-        raise InputError(f"must be Hits, got {shown(out)}", argument="out")
+        raise InputError(f"must be Hits, got {shown(out)}", argument="out", hint="the Hits of an earlier call")
     return [out.t, out.u, out.v, out.prim_id]
 
 

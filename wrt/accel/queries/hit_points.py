@@ -100,7 +100,8 @@ class HitIds(Generic[ArrayT]):
         snapshot, rays, worlds = self._source(name in FROM_RAYS)
         shape, device = self.shape, snapshot.device
         n = int(np.prod(shape))
-        if name in ("error", "normal", "shading", "uv"):
+        origin = snapshot.geometry.origin
+        if name in ("error", "normal", "shading", "uv") or (name == "point" and origin is not None):
             check_recorded(self, name)
         scene, surfaces, object_ids = device_scene(snapshot)
         if name == "shading" and scene.normals is None:
@@ -122,15 +123,17 @@ class HitIds(Generic[ArrayT]):
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         if to_own is not None:
             array = upload(to_own(array.numpy()), wp.int32, device)
+        if name == "error" and origin is not None:  # the sum with the origin is rounded, too
+            array = upload(array.numpy() + np.float32(np.spacing(2.0 * np.abs(origin).max())), array.dtype, device)
         if isinstance(self.prim_id, wp.array):
             if name == "point":
                 record(self._flat(), point=array)
-                array = to_origin(array, snapshot.geometry.origin)
+                array = to_origin(array, origin)
             return in_shape(array, shape)
         give: Any = to_tensor_like(self.prim_id)
         values = array if give is not None and device.is_cuda else array.numpy()
         if name == "point":
-            values = to_origin(values, snapshot.geometry.origin)
+            values = to_origin(values, origin)
         return in_shape(values, shape) if give is None else give(in_shape(values, shape))
 
 

@@ -62,7 +62,7 @@ class Rays(NamedTuple):
 def from_origin(points: Any, origin: np.ndarray | None) -> Any:
     """Return points minus `origin`, subtracted in float64 before they are rounded: NumPy's (N, 3), or Warp's (N,) of vec3 or vec3d."""
     if isinstance(points, wp.array) and (origin is not None or points.dtype == wp.vec3d):
-        check_no_gradients("a structure far from 0", origins=points)
+        check_no_gradients("a query of float64 or far from 0", origins=points)
         return _converted(subtract_origin, points.contiguous(), origin, wp.vec3)
     return points if origin is None else points - origin
 

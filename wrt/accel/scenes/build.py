@@ -296,6 +296,7 @@ def to_flat_scene(mesh: MeshLike) -> FlatScene:
 def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     """Convert the argument `mesh` of `build` to a Mesh or Scene; load it if it is a path.
     Raises InputError for a bad file and for any other type, also for a Geometry and an InstancedGeometry."""
+    from_file = isinstance(mesh, str | os.PathLike)
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         require_file(path := Path(os.fsdecode(mesh)))
         mesh = LOADERS[path.suffix.lower()](path, shapes_only=True) if path.suffix.lower() in (".gltf", ".glb") else load_scene(path)
@@ -309,7 +310,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
         mesh = Mesh(mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3))
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)  # type: ignore[arg-type]  # narrowed without an import of trimesh
-    if isinstance(mesh, Mesh):
+    if isinstance(mesh, Mesh) and not from_file:
         warn_if_far(mesh.vertices, mesh.name, mesh.origin)
     if isinstance(mesh, Scene | Mesh):
         return mesh

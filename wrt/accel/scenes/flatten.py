@@ -147,14 +147,19 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
     vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else empty
     is_clean = len(objects) == 1 and _is_unmoved(objects[0]) and objects[0].mesh.is_clean
     # Far from the origin, rounding puts corners on a line. One call for all objects is faster than a call for each.
-    faces, source = (faces, slice(None)) if is_clean else flip_collinear(vertices, faces)
+    faces, source = (faces, slice(None)) if is_clean else flip_collinear(vertices, faces, all(_is_bare(thing.mesh) for thing in objects))
     return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
 
 
 def _own_space(mesh: Mesh) -> _Joined:
     vertices, faces = mesh.vertices.copy(), mesh.faces.copy()  # because the caller may write to its arrays
-    faces, source = (faces, slice(None)) if mesh.is_clean else flip_collinear(vertices, faces)
+    faces, source = (faces, slice(None)) if mesh.is_clean else flip_collinear(vertices, faces, _is_bare(mesh))
     return _Joined(vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32), mesh.origin)
+
+
+def _is_bare(mesh: Mesh) -> bool:
+    """Return whether vertices are nothing but places, so that two at the same place are one."""
+    return mesh.normals is None and mesh.uvs is None
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from wrt.io.text import as_number, without_comment
 
 T = TypeVar("T", int, float)
 Lines: TypeAlias = Iterator[tuple[int, list[str]]]  # number of a line, and its words
-_KEYWORD = re.compile(r"(?:(?:ST)?C?N?OFF|off)?(\d*)")  # it may be missing; in ModelNet's files the first count follows without a space
+_KEYWORD = re.compile(r"(?:(?:ST|C|N)*OFF|off)?(\d*)")  # it may be missing; in ModelNet's files the first count follows without a space
 
 
 def read(path: Path) -> RawMesh:

@@ -62,13 +62,14 @@ def read(path: Path) -> RawMesh:
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
-    vertices, shifted = near_zero(np.stack([vertex[axis] for axis in "xyz"], axis=1))
-    corners, counts, texcoord = _faces(elements.get("face"), len(vertices))
+    positions = np.stack([vertex[axis] for axis in "xyz"], axis=1)
+    corners, counts, texcoord = _faces(elements.get("face"), len(positions))
     if "tristrips" in elements:
-        strips = _strips(elements["tristrips"], len(vertices))
+        strips = _strips(elements["tristrips"], len(positions))
         corners, counts = np.concatenate([corners, strips]), np.concatenate([counts, np.full(len(strips) // 3, 3)])
         texcoord = None  # strips have none
 
+    vertices, shifted = near_zero(positions, corners)
     finite = np.isfinite(vertices)
     if not finite.all() and len(bad := np.intersect1d(np.flatnonzero(~finite.all(axis=1)), corners)):
         raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", place=f"vertex {bad[0]}")

@@ -72,7 +72,7 @@ def _properties(mi: ModuleType, material: Material) -> Plugin:
 def _to_world(thing: Object) -> Triangles:
     """Return triangles in world space, computed in float64 and rounded once to float32, as in wrt."""
     mesh, linear = thing.mesh, thing.transform[:3, :3]
-    vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.transform[:3, 3]
+    vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.placement[:3, 3]
     # A mirroring transform reverses the winding; exchanging two corners restores it.
     faces = mesh.faces if np.linalg.det(linear) >= 0.0 else mesh.faces[:, [0, 2, 1]]
     world = Triangles(vertices.astype(np.float32), faces, None, mesh.uvs)

@@ -103,12 +103,13 @@ def test_rays_of_a_kernel_see_worlds_and_instances(name: str) -> None:
 
 
 @cpu_only
-@pytest.mark.parametrize("make, flags", [
-    (partial(wp.kernel, enable_backward=False, module="unique"), ""), (wrt.kernel, "-O1"), (wrt.kernel, "-ffp-contract=fast"),
-    (wrt.kernel, "-ffast-math")])
-def test_a_kernel_with_inexact_arithmetic_says_so_and_hits_nothing(make: Callable[..., wp.Kernel], flags: str,
+@pytest.mark.parametrize("make, flags, structure", [
+    (partial(wp.kernel, enable_backward=False, module="unique"), "", "bvh2"), (wrt.kernel, "-O1", "bvh2"),
+    (wrt.kernel, "-ffp-contract=fast", "bvh2"),
+    *((wrt.kernel, "-ffast-math", each) for each in ("bvh2", "bvh4", "bvh8", "bvh8c", "kdtree"))])
+def test_a_kernel_with_inexact_arithmetic_says_so_and_hits_nothing(make: Callable[..., wp.Kernel], flags: str, structure: str,
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    accel = wrt.build(shapes.icosphere(1), "bvh2")
+    accel = wrt.build(shapes.icosphere(1), structure)
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", f"{wp.config.cpu_compiler_flags} {flags}")
     t, prim_id, occluded = answers(make_kernel(wrt.ray_query(accel), make), accel, asked)
