@@ -30,7 +30,7 @@ from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import FAR_IN_A_SCENE, MAX_REACH, SMALLEST, as_number, far_origin, warn_if_alone
+from wrt.scene.values import FAR, FAR_IN_A_SCENE, MAX_REACH, SMALLEST, as_number, far_origin, warn_if_alone
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -170,6 +170,8 @@ class Instances(Accelerator):
         low, high = world_boxes(geometry, rows, self._cache["boxes"])
         if not within_reach(low, high, MAX_REACH):
             raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
+        if geometry.origin is None and not (np.maximum(-low, high) > 0.5 * FAR * (high - low).max(axis=1, keepdims=True)).any():
+            return geometry, rows, low, high
         lows, highs = self._top.low.astype(np.float64), self._top.high.astype(np.float64)
         lows[rows], highs[rows] = low, high
         some = (lows <= highs).all(axis=1)
