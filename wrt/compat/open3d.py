@@ -31,6 +31,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
 from wrt.kernels.placed_rays import SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
+from wrt.scene.clean import flip_collinear
 from wrt.scene.values import LARGEST, as_number, near_zero, type_of, warn_if_alone, warn_if_far
 
 MOST_SAMPLES = 1 << 16
@@ -237,11 +238,16 @@ class RaycastingScene:
             for each in vertices if origin is None else ():
                 if each.dtype == np.float64 and len(each):
                     warn_if_alone(each.min(axis=0), each.max(axis=0), "mesh of add_triangles")
-            mesh = Geometry(positions, np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
+            given = np.concatenate(faces).astype(np.int32)
+            flip = np.isfinite(positions).all()
+            corners, source = flip_collinear(positions, given, by_place=True) if flip else (given, np.arange(len(given)))
+            mesh = Geometry(positions, corners, np.zeros((0, 4), np.float32))
             ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32))
                    for i, (_, indices) in enumerate(self._meshes)]
             of_face, of_mesh = (np.concatenate(column) for column in zip(*ids, ([np.uint32(self.INVALID_ID)],) * 2, strict=True))
-            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face, of_mesh, _normals(mesh), origin)
+            rows = np.append(source, -1)
+            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face[rows], of_mesh[rows],
+                                 _normals(mesh), origin, *_turned(positions, given[source], corners))
         return self._built
 
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
@@ -262,11 +268,16 @@ class _Built(NamedTuple):
     primitive_ids: np.ndarray
     normals: np.ndarray  # (F + 1, 3) float32
     origin: np.ndarray | None  # (3,) float64: subtracted from meshes, rays and points that are far from 0
+    turned: np.ndarray  # (K,) faces that were flipped, ascending
+    uvs: np.ndarray  # (K, 3, 2), coordinates of their corners in the faces that were added
 
     def found(self, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """Return the IDs and coordinates of hits, by the names of the answers."""
         uvs = np.empty((len(u), 2), np.float32)
         uvs[:, 0], uvs[:, 1] = u, v
+        if len(self.turned) and len(some := np.flatnonzero(np.isin(prim_id, self.turned))):
+            weights = np.stack([1.0 - uvs[some, 0] - uvs[some, 1], uvs[some, 0], uvs[some, 1]], axis=-1)
+            uvs[some] = np.einsum("ni,nij->nj", weights, self.uvs[np.searchsorted(self.turned, prim_id[some])])
         return {"geometry_ids": self.geometry_ids.take(prim_id), "primitive_ids": self.primitive_ids.take(prim_id), "primitive_uvs": uvs}
 
 
@@ -309,6 +320,14 @@ def _rows(value: Any, name: str, width: int, origin: np.ndarray | None) -> tuple
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
     rows = array.reshape(-1, width)
     return array.shape[:-1], float32(rows if origin is None else rows - np.append(origin, np.zeros(width - 3)))
+
+
+def _turned(vertices: np.ndarray, given: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which faces (F, 3) differ from the faces `given` in which they lie, and the coordinates of their corners in these."""
+    rows = np.flatnonzero((given != faces).any(axis=1))
+    own, other = (vertices[corners[rows]].astype(np.float64) for corners in (faces, given))
+    edges = (other[:, 1:] - other[:, :1]).transpose(0, 2, 1)
+    return rows, (np.linalg.pinv(edges) @ (own - other[:, :1]).transpose(0, 2, 1)).transpose(0, 2, 1)
 
 
 def _normals(mesh: Geometry) -> np.ndarray:

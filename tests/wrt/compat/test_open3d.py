@@ -11,6 +11,7 @@ import trimesh
 
 import wrt
 from tests.refused import refused
+from tests.wrt.compat.test_trimesh import JOINT
 from wrt.compat.open3d import RaycastingScene
 from wrt.scene import shapes
 
@@ -319,3 +320,19 @@ def test_copies_of_faces_have_an_inside(turned: bool) -> None:
     points = np.float32([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0]])
     assert scene.compute_occupancy(points).numpy().tolist() == [1.0, 0.0]
     assert (scene.compute_signed_distance(points).numpy() < 0).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_joint_that_a_collinear_face_closes_loses_no_ray(shared: bool) -> None:
+    """The coordinates of hits are those in the faces that were added."""
+    vertices, faces = JOINT if shared else (JOINT[0][JOINT[1]].reshape(-1, 3), np.arange(3 * len(JOINT[1])).reshape(-1, 3))
+    rng = np.random.default_rng(0)
+    to = np.c_[rng.random(20_000) * 2, np.zeros((20_000, 2))]
+    origins = np.float32(rng.uniform(0.8, 1.2, to.shape) * [1, 1, 0.5])
+    rays = np.concatenate([origins, np.float32(to) - origins], axis=1)
+    scene = scene_of(BOX.copy().apply_translation([9.0, 0.0, 0.0]), SimpleNamespace(vertices=vertices, faces=faces))
+    found = numpy(scene.cast_rays(rays))
+    assert (found.geometry_ids == 1).all() and set(found.primitive_ids) <= {0, 5, 6}
+    a, b, c = (vertices[faces[found.primitive_ids, i]] for i in range(3))
+    u, v = found.primitive_uvs[:, :1], found.primitive_uvs[:, 1:]
+    assert np.abs((1 - u - v) * a + u * b + v * c - rays[:, :3] - found.t_hit[:, None] * rays[:, 3:]).max() < 1e-5
