@@ -9,20 +9,18 @@ import math
 import sys
 from contextlib import suppress
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from wrt.accel.geometry import Geometry
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.points.enclosing import enclosing
-from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.few_lists import begins
 from wrt.accel.queries.rays import vectors
-from wrt.accel.scenes.build import build
 from wrt.compat.given_rays import RayFormat
+from wrt.compat.joined_meshes import JoinedMeshes
 from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
@@ -31,8 +29,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
 from wrt.kernels.placed_rays import SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
-from wrt.scene.clean import flip_collinear
-from wrt.scene.values import LARGEST, as_number, near_zero, type_of, warn_if_alone, warn_if_far
+from wrt.scene.values import LARGEST, as_number, type_of
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
@@ -79,7 +76,7 @@ class RaycastingScene:
         name = str(device).lower()
         self._device, self._threads = "cpu" if name == "cpu:0" else name, _threads(nthreads)
         self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
-        self._built: _Built | None = None
+        self._built: JoinedMeshes | None = None
 
     def add_triangles(self, vertex_positions: MeshOrArray = None, triangle_indices: ArrayLike | None = None,
                       mesh: object = None) -> int:
@@ -225,29 +222,10 @@ class RaycastingScene:
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
-    def _scene(self) -> _Built:
+    def _scene(self) -> JoinedMeshes:
         """Return the structure over the present meshes."""
         if self._built is None:
-            vertices, faces, n = [], [np.zeros((0, 3), np.int64)], 0
-            for positions, indices in self._meshes:
-                faces.append(indices + n)
-                vertices.append(positions)
-                n += len(positions)
-                warn_if_far(positions, "mesh of add_triangles")
-            positions, origin = near_zero(np.concatenate(vertices) if n else np.zeros((1, 3)))
-            for each in vertices if origin is None else ():
-                if each.dtype == np.float64 and len(each):
-                    warn_if_alone(each.min(axis=0), each.max(axis=0), "mesh of add_triangles")
-            given = np.concatenate(faces).astype(np.int32)
-            flip = np.isfinite(positions).all()
-            corners, source = flip_collinear(positions, given, by_place=True) if flip else (given, np.arange(len(given)))
-            mesh = Geometry(positions, corners, np.zeros((0, 4), np.float32))
-            ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32))
-                   for i, (_, indices) in enumerate(self._meshes)]
-            of_face, of_mesh = (np.concatenate(column) for column in zip(*ids, ([np.uint32(self.INVALID_ID)],) * 2, strict=True))
-            rows = np.append(source, -1)
-            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face[rows], of_mesh[rows],
-                                 _normals(mesh), origin, *_turned(positions, given[source], corners))
+            self._built = JoinedMeshes.of(self._meshes, int(self.INVALID_ID), self._device, self._threads)
         return self._built
 
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
@@ -258,27 +236,6 @@ class RaycastingScene:
         for seed in range(nsamples):
             votes += odd_crossings(query, points, seed)
         return np.asarray(2 * votes > nsamples)
-
-
-class _Built(NamedTuple):
-    """A structure, and what the answers say about its faces, with a last row for prim_id -1."""
-
-    accel: Accelerator
-    geometry_ids: np.ndarray  # (F + 1,) uint32, as primitive_ids
-    primitive_ids: np.ndarray
-    normals: np.ndarray  # (F + 1, 3) float32
-    origin: np.ndarray | None  # (3,) float64: subtracted from meshes, rays and points that are far from 0
-    turned: np.ndarray  # (K,) faces that were flipped, ascending
-    uvs: np.ndarray  # (K, 3, 2), coordinates of their corners in the faces that were added
-
-    def found(self, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the IDs and coordinates of hits, by the names of the answers."""
-        uvs = np.empty((len(u), 2), np.float32)
-        uvs[:, 0], uvs[:, 1] = u, v
-        if len(self.turned) and len(some := np.flatnonzero(np.isin(prim_id, self.turned))):
-            weights = np.stack([1.0 - uvs[some, 0] - uvs[some, 1], uvs[some, 0], uvs[some, 1]], axis=-1)
-            uvs[some] = np.einsum("ni,nij->nj", weights, self.uvs[np.searchsorted(self.turned, prim_id[some])])
-        return {"geometry_ids": self.geometry_ids.take(prim_id), "primitive_ids": self.primitive_ids.take(prim_id), "primitive_uvs": uvs}
 
 
 def _threads(nthreads: int) -> int:
@@ -320,24 +277,6 @@ def _rows(value: Any, name: str, width: int, origin: np.ndarray | None) -> tuple
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
     rows = array.reshape(-1, width)
     return array.shape[:-1], float32(rows if origin is None else rows - np.append(origin, np.zeros(width - 3)))
-
-
-def _turned(vertices: np.ndarray, given: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which faces (F, 3) differ from the faces `given` in which they lie, and the coordinates of their corners in these."""
-    rows = np.flatnonzero((given != faces).any(axis=1))
-    own, other = (vertices[corners[rows]].astype(np.float64) for corners in (faces, given))
-    edges = (other[:, 1:] - other[:, :1]).transpose(0, 2, 1)
-    return rows, (np.linalg.pinv(edges) @ (own - other[:, :1]).transpose(0, 2, 1)).transpose(0, 2, 1)
-
-
-def _normals(mesh: Geometry) -> np.ndarray:
-    """Compute the unit normals of all faces, with a last row 0, for RaycastingScene._scene."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-    with np.errstate(invalid="ignore"):  # for corners that are not finite
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
-    return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
 def _valid_points(value: Any, origin: np.ndarray | None) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:

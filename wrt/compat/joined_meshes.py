@@ -1,0 +1,74 @@
+"""The structure of a RaycastingScene: its meshes joined, with what answers say about their faces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.scenes.build import build
+from wrt.scene.clean import flip_collinear
+from wrt.scene.values import near_zero, warn_if_alone, warn_if_far
+
+
+class JoinedMeshes(NamedTuple):
+    """A structure, and what the answers say about its faces, with a last row for prim_id -1."""
+
+    accel: Accelerator
+    geometry_ids: np.ndarray  # (F + 1,) uint32, as primitive_ids
+    primitive_ids: np.ndarray
+    normals: np.ndarray  # (F + 1, 3) float32
+    origin: np.ndarray | None  # (3,) float64: subtracted from meshes, rays and points that are far from 0
+    turned: np.ndarray  # (K,) faces that were flipped, ascending
+    uvs: np.ndarray  # (K, 3, 2), coordinates of their corners in the faces that were added
+
+    @classmethod
+    def of(cls, meshes: Sequence[tuple[np.ndarray, np.ndarray]], none: int, device: str, threads: int | None) -> Self:
+        """Join meshes (positions, indices) and build. none: id of a miss. Collinear faces that close T joints are flipped."""
+        vertices, faces, n = [], [np.zeros((0, 3), np.int64)], 0
+        for positions, indices in meshes:
+            faces.append(indices + n)
+            vertices.append(positions)
+            n += len(positions)
+            warn_if_far(positions, "mesh of add_triangles")
+        positions, origin = near_zero(np.concatenate(vertices) if n else np.zeros((1, 3)))
+        for each in vertices if origin is None else ():
+            if each.dtype == np.float64 and len(each):
+                warn_if_alone(each.min(axis=0), each.max(axis=0), "mesh of add_triangles")
+        given, flips = np.concatenate(faces).astype(np.int32), np.isfinite(positions).all()
+        corners, source = flip_collinear(positions, given, by_place=True) if flips else (given, np.arange(len(given)))
+        mesh, rows = Geometry(positions, corners, np.zeros((0, 4), np.float32)), np.append(source, -1)
+        ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32)) for i, (_, indices) in enumerate(meshes)]
+        of_face, of_mesh = (np.concatenate(column)[rows] for column in zip(*ids, ([np.uint32(none)],) * 2, strict=True))
+        return cls(build(mesh, "bvh8", device=device, threads=threads), of_face, of_mesh, _normals(mesh), origin,
+                   *_turned(positions, given[source], corners))
+
+    def found(self, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the IDs and coordinates of hits, by the names of the answers."""
+        uvs = np.empty((len(u), 2), np.float32)
+        uvs[:, 0], uvs[:, 1] = u, v
+        if len(self.turned) and len(some := np.flatnonzero(np.isin(prim_id, self.turned))):
+            weights = np.stack([1.0 - uvs[some, 0] - uvs[some, 1], uvs[some, 0], uvs[some, 1]], axis=-1)
+            uvs[some] = np.einsum("ni,nij->nj", weights, self.uvs[np.searchsorted(self.turned, prim_id[some])])
+        return {"geometry_ids": self.geometry_ids.take(prim_id), "primitive_ids": self.primitive_ids.take(prim_id), "primitive_uvs": uvs}
+
+
+def _turned(vertices: np.ndarray, given: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which faces (F, 3) differ from the faces `given` in which they lie, and the coordinates of their corners in these."""
+    rows = np.flatnonzero((given != faces).any(axis=1))
+    own, other = (vertices[corners[rows]].astype(np.float64) for corners in (faces, given))
+    edges = (other[:, 1:] - other[:, :1]).transpose(0, 2, 1)
+    return rows, (np.linalg.pinv(edges) @ (own - other[:, :1]).transpose(0, 2, 1)).transpose(0, 2, 1)
+
+
+def _normals(mesh: Geometry) -> np.ndarray:
+    """Compute the unit normals of all faces, with a last row 0."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    with np.errstate(invalid="ignore"):  # for corners that are not finite
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
+    return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
