@@ -16,7 +16,7 @@ SMALLEST = 1e-30  # smallest length
 MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
 FAR = 32.0  # coordinates of float64 that are larger than this multiple of half their extent lose 5 bits or more in float32
 FAR_IN_FLOAT32 = 256.0  # float32 coordinates this far from 0 have lost 8 bits: a warning
-FAR_IN_A_SCENE = 2.0**14  # an object this far from the scene's 0 is rounded by a thousandth of its size: a warning
+FAR_IN_A_SCENE = 2.0**14  # an object farther from the scene's 0, in units and in half its size, loses too many digits: a warning
 MAX_REACH = 1e18  # largest coordinate in world space: squared distances must not overflow float32
 
 
@@ -57,7 +57,9 @@ def warn_if_far(vertices: np.ndarray, name: str, origin: np.ndarray | None = Non
 
 def warn_if_alone(low: np.ndarray, high: np.ndarray, name: str) -> None:
     """Warn if shapes in a box (low and high, (3,)) lose digits because others of their scene lie near 0."""
-    _warn_of_box(low, high, f"{name}: its vertices", FAR_IN_A_SCENE, "other shapes lie near 0: build what lies far from them by itself")
+    if np.maximum(-low, high).max() > FAR_IN_A_SCENE:
+        hint = "other shapes lie near 0: build what lies far from them by itself"
+        _warn_of_box(low, high, f"{name}: its vertices", FAR_IN_A_SCENE, hint)
 
 
 def _warn_of_box(low: np.ndarray, high: np.ndarray, name: str, far: float, hint: str) -> None:
