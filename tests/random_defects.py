@@ -1,7 +1,7 @@
 """Random defects of closed meshes: copies of faces, T joints, collinear faces, flips, vertices that are not shared.
 
-Each defect leaves the solid as it is. So exact arithmetic on the sound mesh gives the right answers of rays, `contains`, `signed_distance`
-and `winding_number` for the mesh with defects, through every mesh format. `python -m tests.random_defects` checks ten thousand cases.
+Each defect leaves the solid as it is. So exact arithmetic on the sound mesh gives the right answers for the mesh with defects: of rays,
+`contains`, `signed_distance` and `winding_number`, through every mesh format. `python -m tests.random_defects` checks ten thousand cases.
 """
 
 from __future__ import annotations

@@ -170,8 +170,8 @@ class _ScaledStructure:
         vertices[unused] = self.low
         local = Mesh(self.to_local(vertices), faces)
         self.faces, source = flip_collinear(local.vertices, local.faces, by_place=True)
-        self.source = None if self.faces is local.faces or np.array_equal(self.faces, local.faces) else np.append(source, -1)
-        self.accel = build(Mesh(local.vertices, self.faces), device=device, threads=threads)
+        self.source = None if np.array_equal(self.faces, local.faces) else np.append(source, -1)
+        self.accel = build(local if self.source is None else Mesh(local.vertices, self.faces), device=device, threads=threads)
         self.threads, self.vertices = thread_count(threads), vertices
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2

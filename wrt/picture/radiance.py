@@ -38,9 +38,9 @@ def read_hdr(data: bytes, most: int, decode_runs: Callable[[], np.ndarray]) -> t
         raise InputError("cannot be read as an image: it must have FORMAT=32-bit_rle_rgbe, GAMMA 1, and EXPOSURE and COLORCORR above 0")
     height, width, body = int(header[4]), int(header[6]), data[header.end():]
     check_size(width, height, most)
-    coded = bytes((2, 2, width >> 8 & 255, width & 255))  # begins a line with run lengths by channel
-    runs = 8 <= width < 32768 and body[:2] == b"\2\2" and body[2:3] < b"\x80"
-    if 8 <= width < 32768 and not runs and any(body[first : first + 4] == coded for first in range(0, 4 * width * height, 4 * width)):
+    may_run, coded = 8 <= width < 32768, bytes((2, 2, width >> 8 & 255, width & 255))  # begins a line with run lengths by channel
+    runs = may_run and body[:2] == b"\2\2" and body[2:3] < b"\x80"
+    if may_run and not runs and any(body[first : first + 4] == coded for first in range(0, 4 * width * height, 4 * width)):
         raise InputError("cannot be read as an image: it has lines with run lengths and lines without")
     pixels = (decode_runs() if runs else _decode(body, height * width)).reshape(height, width, 3) / factor
     by_columns = header[3] == b"X"

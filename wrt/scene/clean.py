@@ -170,7 +170,7 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray, by_place: bool = Fal
     replaces the face and its neighbour by (a, b, d) and (b, c, d): as many faces, and the same area.
 
     vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). Returned face i lies in input
-    face source[i], whose material and group apply to it. Faces with two equal corners stay as they are, and so do faces whose
+    face source[i], whose material and group apply to it. Faces with two equal corners stay as they are. So do faces whose
     longest edge does not belong to exactly two faces. by_place: vertices at the same place are one."""
     without = ~has_area(vertices, faces)
     if not (by_place and without.any()):

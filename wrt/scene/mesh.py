@@ -69,7 +69,7 @@ class Mesh:
             with contextlib.suppress(ValueError, TypeError, IndexError):
                 raw = np.asarray(self.vertices)
                 if raw.dtype.kind in "fiu" and raw.shape[1:] == (3,):
-                    near, origin = near_zero(raw, np.asarray(self.faces, np.int64))
+                    near, origin = near_zero(raw, np.asarray(self.faces))
                     if origin is not None:
                         object.__setattr__(self, "vertices", near)
                         object.__setattr__(self, "origin", origin)
@@ -142,9 +142,9 @@ class Mesh:
     def save(self, path: PathLike) -> None:
         """Write vertices and faces to a file that `wrt.load_mesh` reads.
 
-        .npz, .ply and .obj also have normals and uvs, and .npz has the groups. .npz keeps all bits; .obj, .off, .ply, .stl and .glb keep
+        .npz, .ply and .obj also have normals and uvs, and .npz has the groups. .npz keeps all bits. .obj, .off, .ply, .stl and .glb keep
         those of the vertices. trimesh may round in other formats (.dae: seven digits). A mesh with an origin keeps it in .npz, .obj and
-        .off; others round positions to float32, with a warning.
+        .off. Others round its positions to float32, with a warning.
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class Mesh:
             return
         options: dict[str, Any] = {}
         if self.origin is not None and path.suffix.lower() not in (".obj", ".off"):
-            warn_if_far(self.positions.astype(np.float32), f"{path}")
+            warn_if_far(self.positions.astype(np.float32), str(path))
         if path.suffix.lower() in (".obj", ".off"):  # numbers without an exponent: nine digits of the smallest keep all bits of a float32
             smallest = np.abs(self.vertices).min(initial=1.0, where=self.vertices != 0.0)
             options["digits"] = 9 - math.floor(math.log10(smallest))

@@ -507,7 +507,7 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
 
 
 def test_compare_sees_where_a_crop_lies() -> None:
-    """Two crops with the same pixels, of which one lies two columns further to the right in the picture."""
+    """Two crops have the same pixels, and one lies two columns further to the right in the picture."""
     import OpenImageIO as oiio
 
     for name, x in (("left.exr", 0), ("right.exr", 2)):

@@ -194,3 +194,11 @@ def test_an_infinite_sun_in_other_primaries_stays_white(tmp_path: Path) -> None:
     path = save(tmp_path / "a.exr", (with_primaries(pixels, AP0), pixels))
     with pytest.warns(SceneWarning, match="1 pixel negative, NaN or infinite"):
         assert read_image(path, environment=True)[0, 0] == pytest.approx([65504.0] * 3, rel=1e-5)
+
+
+def test_a_cube_map_is_refused(tmp_path: Path) -> None:
+    pixels = colours(48, 8)
+    spec = specification(pixels, textureformat="CubeFace Environment")
+    spec.attribute("openexr:envmap", 1)
+    with refused(what="it is a cube map", path="a.exr"):
+        read_image(save(tmp_path / "a.exr", (spec, pixels)))

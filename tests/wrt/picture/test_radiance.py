@@ -111,3 +111,9 @@ def test_a_header_without_a_size_is_refused(size: str, tmp_path: Path) -> None:
 def test_the_other_first_line_and_line_ends_of_windows(tmp_path: Path) -> None:
     assert read(tmp_path, "-Y 1 +X 1", BRIGHT, FORMAT, magic="#?RGBE")[0, 0, 0] == 1.0
     assert read(tmp_path, "\r\n-Y 1 +X 1\r", BRIGHT, "EXPOSURE=2\r\n" + FORMAT.replace("\n", "\r"), magic="#?RADIANCE\r")[0, 0, 0] == 0.5
+
+
+def test_lines_with_and_without_run_lengths_are_refused_together(tmp_path: Path) -> None:
+    rgbe = np.random.default_rng(0).integers(128, 255, (3, 16, 4), dtype=np.uint8)
+    with refused(what="lines with run lengths and lines without", path="a.hdr"):
+        read(tmp_path, "-Y 3 +X 16", rgbe[0].tobytes() + in_runs(rgbe[1:]))

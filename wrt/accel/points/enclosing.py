@@ -93,11 +93,11 @@ def enclosing_faces(geometry: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _counted(edges: np.ndarray, free: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Return which faces count, (N,) bool: those that are not free, and free ones that close the surface. edges: (N, 3), of `edges_of`.
+    """Return which faces count, (N,) bool: all that are not free, and free ones that close the surface. edges: (N, 3), of `edges_of`.
 
     Two free faces at an edge that is closed without them form a patch. A patch whose border is open without it counts; a wall does not.
     The last patches are those without a border: copies count, collinear faces do not."""
-    counted, free, n = ~free, free.copy(), edges.max(initial=-1) + 1
+    counted, free, none, n = ~free, free.copy(), np.zeros(len(free), bool), edges.max(initial=-1) + 1
     lonely = (np.bincount(edges.reshape(-1), minlength=n) == 1)[edges]
     while free.any():
         odd, free_at = np.bincount(edges[counted].reshape(-1), minlength=n) % 2 == 1, np.bincount(edges[free].reshape(-1), minlength=n)
@@ -106,8 +106,8 @@ def _counted(edges: np.ndarray, free: np.ndarray, flat: np.ndarray) -> np.ndarra
         border = free[:, None] & (free_at == 1)[edges]
         wall, gap, end = ((np.bincount(label, which.any(axis=1), len(label)) > 0)[label] & free
                           for which in (border & ~lonely & ~odd[edges], border & odd[edges], border & lonely))
-        done, yes = next(((done, yes) for done, yes in ((wall | gap, gap & ~wall), (end, end & False), (free & ~flat, free)) if done.any()),
-                         (free, free & False))
+        rules = (wall | gap, gap & ~wall), (end, none), (free & ~flat, free), (free, none)
+        done, yes = next(rule for rule in rules if rule[0].any())
         counted |= done & yes
         free &= ~done
     return counted

@@ -43,7 +43,8 @@ def test_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("old", "new"), [
-    ("COFF 5 5 0", "COFF5 5 0"), ("COFF 5 5 0", "OFF5 5 0"), ("COFF 5 5 0", "STCNOFF5 5"), ("COFF 5 5 0", "off\n# counts\n5 5 0 # of all"),
+    ("COFF 5 5 0", "COFF5 5 0"), ("COFF 5 5 0", "OFF5 5 0"), ("COFF 5 5 0", "STCNOFF5 5"),
+    ("COFF 5 5 0", "CSTOFF 5 5 0"), ("COFF 5 5 0", "NCSTOFF 5 5 0"), ("COFF 5 5 0", "off\n# counts\n5 5 0 # of all"),
     ("COFF 5 5 0", "5 5 0"), ("COFF", "COFF# 3 1 0\n"), ("0.5 0.5 1 ", "5.0D-01 5d-1 1D0 1.#IND "), ("\n", "\r\n"),
 ])
 def test_variants_of_off(old: str, new: str, tmp_path: Path) -> None:
