@@ -29,7 +29,6 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from tests.data import ROOT
-from tests.trust import record
 
 FOLDERS = "kernels/units", "kernels/wide"
 SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&": "|", "|": "&",
@@ -206,7 +205,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="start no mutant after this time")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--thorough", action="store_true", help="run slow tests, too: minutes for each survivor")
-    parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     parser.add_argument("--show", action="store_true", help="print the mutants, and run nothing")
     options = parser.parse_args()
     if min(options.count, options.workers) < 1 or options.first < 0:
@@ -220,9 +218,6 @@ def main() -> None:
     counts = Counter(outcomes.values())
     found = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
     print(f"{len(outcomes)} mutants: {found}", *(mutant for mutant in outcomes if outcomes[mutant] == "survived"), sep="\n")
-    if options.record:
-        counted = counts["noticed"] + counts["survived"]
-        record("mutants", f"{counted} one-token changes of {' and '.join(FOLDERS)}", found)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from tests.fuzz.formats import ALL_FORMATS, FORMATS, make_case
-from tests.trust import record
 
 HANG = 40.0  # Largest processor time of an input, in seconds.
 STUCK = 60.0  # Longest wait for an input, in seconds.
@@ -138,7 +137,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="index of the first input of each format")
     parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="folder for the inputs with defects; is emptied first")
-    parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     options = parser.parse_args()
     names = options.format or list(FORMATS)
     shutil.rmtree(options.out, ignore_errors=True)
@@ -158,8 +156,6 @@ def main() -> None:
     total = sum(run.tally.inputs for run in runs)
     defects = sum(len(numbers) for run in runs for numbers in run.tally.defects.values())
     print(f"{total} inputs, {defects} defects, {time.perf_counter() - begin:.0f} s")
-    if options.record:
-        record("fuzz", f"{total:,} damaged files of {len(names)} formats", f"{defects} defects")
     raise SystemExit(1 if defects else 0)
 
 
