@@ -19,8 +19,8 @@ from tests.kernel_tools import DEVICE, cpu_only
 from wrt.accel.base import OneMesh
 from wrt.accel.instances import Instances
 from wrt.accel.queries.answers import Hits
-from wrt.scene.sensors.sensor import Sensor
 from wrt.scene.shapes import icosphere
+from wrt.sensors.sensor import Sensor
 
 N = 100
 BALL = icosphere(2)

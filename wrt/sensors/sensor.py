@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Protocol
@@ -134,25 +133,13 @@ class Sensor(Generic[ArrayT]):
 
 
 def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: int | None, like: object) -> Sensor[Any]:
-    """Make a sensor from directions in its own frame: (rows, columns, 3), or (B, rows, columns, 3) for B different sensors.
+    """Make a sensor from directions in its own frame, float64: (rows, columns, 3), or (B, rows, columns, 3) for B different sensors.
 
-    Parameters
-    ----------
-    local
-        Directions, float64.
-    pose
-        (4, 4), or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4). Or OpenCV's pair (R, t).
-    axis
-        Index of the frame's axis that measures depth.
-    rolling
-        Axis of `local`, 0 or 1, along which each row or column has its own pose; None: all pixels of an image share a pose.
-    like
-        Array of the library and device that the rays get; None: those of `pose`.
+    - pose: (4, 4) or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4); or OpenCV's pair (R, t).
+    - axis: index of the frame's axis that measures depth. like: array of the library and device that the rays get; None: `pose`.
+    - rolling: axis of `local`, 0 or 1, along which each row or column has its own pose; None: all pixels of an image share a pose.
 
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected.
+    Raises InputError that names the argument and what was expected.
     """
     poses, size = as_poses(pose), local.shape[-3:]
     many, own = poses.shape[:-2], () if rolling is None else (size[rolling],)
@@ -220,11 +207,19 @@ def as_poses(pose: ArrayLike | None) -> np.ndarray:
     poses = as_doubles(pose, "pose")
     if poses.shape[-2:] != (4, 4) or poses.size == 0:
         raise InputError(f"must be (4, 4) or (B, 4, 4), sensor to world, got {poses.shape}", argument="pose")
-    for good, what in _conditions(poses):
-        if not good.all():
-            place = np.unravel_index(int(np.argmin(good)), good.shape) if good.ndim else ()
-            raise InputError(f"must be {what}" + (f"; pose {', '.join(map(str, place))} is not" if place else ""), argument="pose")
+    _require(np.isfinite(poses).all(axis=(-2, -1)), "finite")
+    _require(np.abs(poses[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1) <= 1e-6, "affine (last row 0 0 0 1)")
+    rotation = poses[..., :3, :3]
+    error = np.abs(rotation @ rotation.swapaxes(-2, -1) - np.eye(3)).max(axis=(-2, -1))
+    _require((error <= MAX_ROTATION_ERROR) & (np.linalg.det(rotation) > 0.0), "a rotation and a translation")
     return poses
+
+
+def _require(good: np.ndarray, what: str) -> None:
+    """Raise InputError that names the first pose that is not `what`. good: bool for each pose."""
+    if not good.all():
+        place = np.unravel_index(int(np.argmin(good)), good.shape) if good.ndim else ()
+        raise InputError(f"must be {what}" + (f"; pose {', '.join(map(str, place))} is not" if place else ""), argument="pose")
 
 
 def _from_opencv(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -248,15 +243,6 @@ def _from_opencv(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
     poses[..., :3, :3], poses[..., 3, 3] = rotation.swapaxes(-2, -1), 1.0
     poses[..., :3, 3] = -(poses[..., :3, :3] @ shift.reshape(*many, 3, 1))[..., 0]
     return poses
-
-
-def _conditions(poses: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
-    """Yield, for each condition, whether each pose meets it."""
-    yield np.isfinite(poses).all(axis=(-2, -1)), "finite"
-    yield np.abs(poses[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1) <= 1e-6, "affine (last row 0 0 0 1)"
-    rotation = poses[..., :3, :3]
-    error = np.abs(rotation @ rotation.swapaxes(-2, -1) - np.eye(3)).max(axis=(-2, -1))
-    yield (error <= MAX_ROTATION_ERROR) & (np.linalg.det(rotation) > 0.0), "a rotation and a translation"
 
 
 def _of_library(rays: np.ndarray, like: object) -> Any:

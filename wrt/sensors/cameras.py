@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,10 @@ from wrt.core.checks import as_size, shown
 from wrt.core.errors import InputError
 from wrt.core.suggestions import suggest_keywords
 from wrt.core.types import ArrayLike
-from wrt.scene.sensors.distortion import Fisheye, Radial
-from wrt.scene.sensors.sensor import Sensor, as_doubles, make_sensor
+from wrt.sensors.lenses import Fisheye, Radial
+from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
 
-FOLDS = "it folds over before this pixel"
-FOLDS_OR_TURNS = FOLDS + ", or the angle from the axis would exceed pi"
+Lens = Radial | Fisheye
 
 
 @suggest_keywords
@@ -52,14 +50,7 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or the rays exceed the range of float32.
     """
-    lens = Radial(distortion)
-
-    def directions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        (x, y), exists = lens.undistort_picture(x, y)
-        _require_rays(exists, FOLDS)
-        return _at_depth_1(x, y)
-
-    return make_sensor(_picture(intrinsics, size, directions), pose, 2, 0 if rolling else None, like)
+    return make_sensor(_picture(Radial(distortion), intrinsics, size), pose, 2, 0 if rolling else None, like)
 
 
 def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
@@ -83,14 +74,7 @@ def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or a corner would show an angle above pi.
     """
-    lens = Fisheye(distortion)
-
-    def directions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        out, exists = _fisheye_directions(lens, x, y)
-        _require_rays(exists, FOLDS_OR_TURNS)
-        return out
-
-    return make_sensor(_picture(intrinsics, size, directions), pose, 2, 0 if rolling else None, like)
+    return make_sensor(_picture(Fisheye(distortion), intrinsics, size), pose, 2, 0 if rolling else None, like)
 
 
 def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = (), fisheye: bool = False) -> Any:
@@ -108,22 +92,10 @@ def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = ()
     (..., 2) float64
         Column and row, also outside the picture; NaN for points that a pinhole camera does not see, with z <= 0, and for those that a
         fisheye camera shows at no pixel: the camera itself and points exactly behind it.
-
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected.
     """
-    k, place = _intrinsics(intrinsics), _rows_of(points, "points", 3)
-    x, y, z = np.moveaxis(place, -1, 0)
+    k, place, lens = _intrinsics(intrinsics), _rows_of(points, "points", 3), _lens(distortion, fisheye)
     with np.errstate(all="ignore"):
-        if fisheye:
-            across = np.hypot(x, y)
-            scale = np.where(across > 0.0, Fisheye(distortion).radius(np.arctan2(across, z)) / across, np.where(z > 0.0, 0.0, np.nan))
-            x, y = x * scale, y * scale
-        else:
-            ahead = np.where(z > 0.0, z, np.nan)
-            x, y = Radial(distortion).distort(x / ahead, y / ahead)
+        x, y = lens.points(*np.moveaxis(place, -1, 0))
         pixels = np.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], axis=-1)
     return given_like(points, pixels)
 
@@ -148,27 +120,36 @@ def unproject(pixels: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = 
     InputError
         Names the argument and what was expected, or the first pixel that no ray reaches, because the distortion folds over.
     """
-    k, place = _intrinsics(intrinsics), _rows_of(pixels, "pixels", 2)
-    x, y = _on_plane(k, place[..., 0], place[..., 1])
-    if fisheye:
-        directions, exists = _fisheye_directions(Fisheye(distortion), x, y)
-    else:
-        (x, y), exists = Radial(distortion).undistort(x, y)
-        directions = _at_depth_1(x, y)
-    _require_rays(exists, FOLDS_OR_TURNS if fisheye else FOLDS, place)
+    place, lens = _rows_of(pixels, "pixels", 2), _lens(distortion, fisheye)
+    directions, exists = lens.rays(*_on_plane(_intrinsics(intrinsics), place[..., 0], place[..., 1]))
+    if not exists.all():
+        raise _no_ray(lens, *place[~exists][0])
     return given_like(pixels, directions)
 
 
-def _picture(intrinsics: ArrayLike, size: tuple[int, int] | str, directions: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return the directions of all pixels: (rows, columns, 3), or (B, rows, columns, 3) for B intrinsics.
+def _lens(distortion: ArrayLike, fisheye: bool) -> Lens:
+    return Fisheye(distortion) if fisheye else Radial(distortion)
 
-    directions: makes them from the pixels' points on the plane z = 1, which are still distorted.
-    """
+
+def _no_ray(lens: Lens, column: float, row: float) -> InputError:
+    return InputError(f"leaves pixel ({column:g}, {row:g}) without a ray: {lens.no_ray}", argument="distortion",
+                      hint="check the order of the coefficients, or fit fewer of them, or crop the picture")
+
+
+def _picture(lens: Lens, intrinsics: ArrayLike, size: tuple[int, int] | str) -> np.ndarray:
+    """Return the directions of all pixels: (rows, columns, 3), or (B, rows, columns, 3) for B intrinsics."""
     ks, (width, height) = as_doubles(intrinsics, "intrinsics"), as_size(size)
-    columns, rows = np.arange(float(width))[None, :], np.arange(float(height))[:, None]
+    columns, rows = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
+
+    def of_one(k: np.ndarray) -> np.ndarray:
+        directions, exists = lens.rays_of_picture(*_on_plane(k, columns, rows))
+        if not exists.all():
+            raise _no_ray(lens, *np.argwhere(~exists)[0][::-1])
+        return directions
+
     if ks.ndim != 3 or not len(ks):
-        return directions(*np.broadcast_arrays(*_on_plane(_intrinsics(ks), columns, rows)))
-    return np.stack([directions(*np.broadcast_arrays(*_on_plane(_intrinsics(k, i), columns, rows))) for i, k in enumerate(ks)])
+        return of_one(_intrinsics(ks))
+    return np.stack([of_one(_intrinsics(k, i)) for i, k in enumerate(ks)])
 
 
 def _intrinsics(value: ArrayLike, index: int | None = None) -> np.ndarray:
@@ -188,32 +169,8 @@ def _on_plane(k: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.nd
     return (column - k[0, 2] - k[0, 1] * y) / k[0, 0], y
 
 
-def _at_depth_1(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the directions (..., 3) to points on the plane z = 1."""
-    out = np.empty((*x.shape, 3))
-    out[..., 0], out[..., 1], out[..., 2] = x, y, 1.0
-    return out
-
-
-def _fisheye_directions(lens: Fisheye, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit directions that a fisheye lens shows at (x, y), and whether each exists."""
-    radius = np.hypot(x, y)
-    angle, exists = lens.angle(radius)
-    scale = np.divide(np.sin(angle), radius, out=np.ones_like(radius), where=radius > 0.0)
-    return np.stack([x * scale, y * scale, np.cos(angle)], axis=-1), exists
-
-
 def _rows_of(value: ArrayLike, name: str, columns: int) -> np.ndarray:
     array = as_doubles(value, name)
     if array.shape[-1:] != (columns,):
         raise InputError(f"must be (..., {columns}), got {array.shape}", argument=name)
     return array
-
-
-def _require_rays(exists: np.ndarray, why: str, pixels: np.ndarray | None = None) -> None:
-    """Raise InputError that names the first pixel without a ray. pixels: (..., 2), or None for the pixels of a picture."""
-    if not exists.all():
-        first = int(np.argmin(exists))
-        column, row = np.unravel_index(first, exists.shape)[::-1] if pixels is None else pixels.reshape(-1, 2)[first]
-        raise InputError(f"leaves pixel ({column:g}, {row:g}) without a ray: {why}", argument="distortion",
-                         hint="check the order of the coefficients, or fit fewer of them, or crop the picture")

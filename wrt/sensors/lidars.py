@@ -1,4 +1,4 @@
-"""LiDARs as arrays of rays: by their angles, or by the name of a device."""
+"""LiDARs as arrays of rays, by their angles or by the name of a device, and the noise of range sensors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from wrt.core.arrays import given_like
 from wrt.core.checks import as_array, as_integer, as_size, require_known, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
-from wrt.scene.sensors.sensor import Sensor, make_sensor
 from wrt.scene.values import as_number
+from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
 
 TURN = 2.0 * np.pi
 
@@ -65,11 +66,6 @@ def lidar(name: str, pose: ArrayLike | None = None, columns: int | None = None, 
     -------
     Sensor
         Directions have unit length, so that t of a hit is its range.
-
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected.
     """
     require_known(name, LIDARS, "LiDAR", "name")
     model = LIDARS[name]
@@ -128,12 +124,10 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
         Field of view in radians: the angle from the first column to the last, and from the first row to the last.
     size
         Columns and rows, or text such as "240x80".
-    pose
-        (4, 4), sensor to world; (B, 4, 4): B sensors.
+    pose, like
+        See `rotating_lidar`.
     rolling
         `pose` is (rows, 4, 4) or (B, rows, 4, 4), the pose of each row.
-    like
-        See `pinhole`.
 
     Returns
     -------
@@ -160,3 +154,46 @@ def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Return unit vectors (rows, columns, 3) in a frame with x forward, y left, z up. Angles are in radians."""
     level = np.cos(elevation)
     return np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=-1)
+
+
+def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> Any:
+    """Add the noise of a range sensor to ranges, independently for each element.
+
+    The error of a range r is normally distributed with the standard deviation sqrt(constant^2 + (proportional r)^2). A result
+    below 0 becomes 0.
+
+    Parameters
+    ----------
+    ranges
+        True ranges in scene units, 0 or more, of any shape; a miss is inf and stays inf.
+    seed
+        The same seed and shape give the same noise.
+    constant, proportional
+        Parts of the standard deviation: one in scene units, and one as a fraction of r.
+    dropout
+        Probability, 0 to 1, that a hit becomes a miss (inf).
+
+    Returns
+    -------
+    float32 array of the shape and the library of `ranges`
+
+    Raises
+    ------
+    InputError
+        If a range is NaN, negative or, with its noise, beyond float32, or an argument is out of range.
+    """
+    given, ranges = ranges, as_doubles(ranges, "ranges")
+    if not (ranges >= 0.0).all():
+        raise InputError(f"must be 0 or more, or inf for a miss, got {ranges[~(ranges >= 0.0)][0]:g}", argument="ranges")
+    constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"), (proportional, "proportional")))
+    if not 0.0 <= as_number(dropout, "dropout") <= 1.0:
+        raise InputError(f"must be 0 to 1, got {dropout:g}", argument="dropout")
+    rng = np.random.default_rng(as_integer(seed, "seed", 0, (1 << 63) - 1))
+    normal, lost = rng.standard_normal(ranges.shape), rng.random(ranges.shape) < dropout
+    hit = np.isfinite(ranges) & ~lost
+    r = np.where(hit, ranges, 0.0)
+    noisy = np.where(hit, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf)
+    out = as_array(noisy, np.float32, "ranges").reshape(ranges.shape)
+    if (hit & np.isinf(out)).any():
+        raise InputError("must be within the range of float32, with their noise, or inf for a miss", argument="ranges")
+    return given_like(given, out)

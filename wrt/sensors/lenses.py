@@ -1,8 +1,7 @@
 """Lens distortion as OpenCV defines it, and its inverse.
 
-Source: OpenCV's documentation, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model". A point (x, y) is on the plane
-z = 1 of the camera's frame. The function `distort` moves it to where the lens shows it. A pixel's ray needs the inverse, which
-has no closed form.
+Source: OpenCV's documentation, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model". A lens shows a direction at a
+point (x, y) of the plane z = 1 of the camera's frame. A pixel's ray needs the inverse, which has no closed form.
 """
 
 import numpy as np
@@ -16,10 +15,13 @@ STEPS = 64  # Of the path from the centre to a point.
 NODES = 65  # Of the grid of a picture, at most, along each side.
 EXACT = 1e-13  # Largest error of an inverse, on the plane z = 1 and relative to a point there that is farther than 1.
 Points = tuple[np.ndarray, np.ndarray]  # x and y
+Rays = tuple[np.ndarray, np.ndarray]  # directions (..., 3), and whether each exists
 
 
 class Radial:
     """Radial (rational), tangential and thin-prism distortion. coefficients: see `pinhole`."""
+
+    no_ray = "it folds over before this pixel"
 
     def __init__(self, coefficients: ArrayLike) -> None:
         given = as_array(coefficients, np.float64, "distortion").reshape(-1)
@@ -30,11 +32,38 @@ class Radial:
                              f" {shown(coefficients)}", argument="distortion", hint="the tilted sensor of 14 numbers is not modelled")
         self.coefficients = np.pad(given, (0, 12 - len(given)))
 
-    def distort(self, x: np.ndarray, y: np.ndarray) -> Points:
-        """Return the distorted points."""
-        return self.with_derivatives(x, y)[0]
+    def points(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Points:
+        """Return where the lens shows directions; NaN where z <= 0."""
+        ahead = np.where(z > 0.0, z, np.nan)
+        return self._distort(x / ahead, y / ahead)[0]
 
-    def with_derivatives(self, x: np.ndarray, y: np.ndarray) -> tuple[Points, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    def rays(self, x: np.ndarray, y: np.ndarray) -> Rays:
+        """Return the directions (..., 3), with z = 1, that the lens shows at (x, y), and whether each exists."""
+        return _at_depth_1(*self._undistort(x, y))
+
+    def rays_of_picture(self, x: np.ndarray, y: np.ndarray) -> Rays:
+        """Return `rays` of the pixels of a picture, (rows, columns). The inverse of each pixel begins at that of a near pixel.
+
+        If some of the near pixels have no ray, only these are reported.
+        """
+        if x.size <= NODES * NODES or not self.coefficients.any():
+            return self.rays(x, y)
+        steps = [-(-n // NODES) for n in x.shape]
+        near = np.ix_(*(np.arange(0, n, step) for n, step in zip(x.shape, steps, strict=True)))
+        nodes, exists = self._undistort(x[near], y[near])
+        if not exists.all():
+            everywhere = np.ones(x.shape, bool)
+            everywhere[near] = exists
+            return _at_depth_1((x, y), everywhere)
+        cell = max(float(np.hypot(*(np.diff(each, axis=axis) for each in nodes)).max(initial=0.0)) for axis in (0, 1))
+        nearest = np.ix_(*(np.minimum((np.arange(n) + step // 2) // step, (n - 1) // step)
+                           for n, step in zip(x.shape, steps, strict=True)))
+        start = nodes[0][nearest], nodes[1][nearest]
+        with np.errstate(all="ignore"):
+            found, good = self._polished(start, (x, y), np.ones(x.shape, bool))
+            return _at_depth_1(found, good & (_distance(found, start) <= 2.0 * cell))
+
+    def _distort(self, x: np.ndarray, y: np.ndarray) -> tuple[Points, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """Return the distorted points (X, Y), and dX/dx, dX/dy, dY/dx, dY/dy; the derivatives are NaN beyond a pole."""
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self.coefficients
         r2 = x * x + y * y
@@ -48,7 +77,7 @@ class Radial:
         return points, (scale + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x + prism_x * x, cross + prism_x * y,
                         cross + prism_y * x, scale + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x + prism_y * y)
 
-    def undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[Points, np.ndarray]:
+    def _undistort(self, x: np.ndarray, y: np.ndarray) -> tuple[Points, np.ndarray]:
         """Return the points that the lens shows at (x, y), and whether each exists.
 
         The inverse is followed from the centre to each point. It ends where the distortion folds over: where the determinant of its
@@ -67,35 +96,17 @@ class Radial:
                 found = settled
             return self._polished(found, (x, y), exists)
 
-    def undistort_picture(self, x: np.ndarray, y: np.ndarray) -> tuple[Points, np.ndarray]:
-        """Return the same as `undistort` for the pixels of a picture, (rows, columns), from a grid of fewer points.
-
-        If points of the grid have no inverse, only these are reported.
-        """
-        if x.size <= NODES * NODES or not self.coefficients.any():
-            return self.undistort(x, y)
-        rows, columns = (np.unique(np.linspace(0, n - 1, min(n, NODES)).round().astype(int)) for n in x.shape)
-        exists, grid = np.ones(x.shape, bool), np.ix_(rows, columns)
-        nodes, exists[grid] = self.undistort(x[grid], y[grid])
-        if not exists.all():
-            return (x, y), exists
-        start = [_interpolated(each, rows, columns, x.shape) for each in nodes]
-        cell = max(float(np.hypot(*(np.diff(each, axis=axis) for each in nodes)).max(initial=0.0)) for axis in (0, 1))
-        with np.errstate(all="ignore"):
-            found, good = self._polished((start[0], start[1]), (x, y), np.ones(x.shape, bool))
-            return found, good & (_distance(found, (start[0], start[1])) <= cell)
-
     def _polished(self, start: Points, ends: Points, exists: np.ndarray) -> tuple[Points, np.ndarray]:
         found, good = self._newton(start, ends, 6)
-        miss = _distance(self.distort(*found), ends)
+        miss = _distance(self._distort(*found)[0], ends)
         return found, exists & good & (miss <= EXACT * np.maximum(1.0, np.hypot(*ends)))
 
     def _newton(self, start: Points, ends: Points, steps: int) -> tuple[Points, np.ndarray]:
-        """Take steps of Newton's method, and return whether the determinant was positive at each."""
+        """Return the points after steps of Newton's method, and whether the distortion did not fold over at any of them."""
         x, y = start
         good = np.ones(x.shape, bool)
         for _ in range(steps):
-            (at_x, at_y), (a, b, c, d) = self.with_derivatives(x, y)
+            (at_x, at_y), (a, b, c, d) = self._distort(x, y)
             determinant = a * d - b * c
             good &= (determinant > 0.0) & (a + d > 0.0)
             dx, dy = ends[0] - at_x, ends[1] - at_y
@@ -106,42 +117,48 @@ class Radial:
 class Fisheye:
     """OpenCV's fisheye model: a direction at the angle theta from the axis is shown at theta (1 + k1 theta^2 + ... + k4 theta^8)."""
 
+    no_ray = f"{Radial.no_ray}, or the angle from the axis would exceed pi"
+
     def __init__(self, coefficients: ArrayLike) -> None:
         given = as_array(coefficients, np.float64, "distortion").reshape(-1)
         if len(given) not in (0, 4) or not np.isfinite(given).all():
             raise InputError(f"must be 4 finite numbers, k1 to k4, got {shown(coefficients)}", argument="distortion")
-        self.powers = np.array([1.0, *given]) if len(given) else np.array([1.0])
+        self.powers = np.array([1.0, *given])
         slope = self.powers * (2 * np.arange(len(self.powers)) + 1)  # of the shown radius, by theta^2
         turns = np.roots(np.trim_zeros(slope[::-1], "f"))
         folds = turns.real[(np.abs(turns.imag) <= 1e-9 * np.abs(turns)) & (turns.real > 0.0)]
         self.largest = min(float(np.sqrt(folds.min(initial=np.inf))), np.pi)  # angle up to which the radius grows
 
-    def radius(self, theta: np.ndarray) -> np.ndarray:
-        """Return the radius at which the lens shows an angle from the axis."""
-        square, out = theta * theta, np.zeros_like(theta)
-        for power in self.powers[::-1]:
-            out = out * square + power
-        return theta * out
+    def points(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Points:
+        """Return where the lens shows directions; NaN for 0 and for the direction straight back."""
+        across = np.hypot(x, y)
+        scale = np.where(across > 0.0, self._radius(np.arctan2(across, z)) / across, np.where(z > 0.0, 0.0, np.nan))
+        return x * scale, y * scale
 
-    def angle(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the angle that the lens shows at a radius, and whether it exists. By bisection, as the radius grows."""
-        exists = radius <= self.radius(np.array(self.largest))
+    def rays(self, x: np.ndarray, y: np.ndarray) -> Rays:
+        """Return the unit directions (..., 3) that the lens shows at (x, y), and whether each exists."""
+        radius = np.hypot(x, y)
         low, high = np.zeros_like(radius), np.full_like(radius, self.largest)
-        for _ in range(54):
+        for _ in range(54):  # by bisection, as the radius grows with the angle
             middle = 0.5 * (low + high)
-            less = self.radius(middle) < radius
+            less = self._radius(middle) < radius
             low, high = np.where(less, middle, low), np.where(less, high, middle)
-        return 0.5 * (low + high), exists
+        angle = 0.5 * (low + high)
+        scale = np.divide(np.sin(angle), radius, out=np.ones_like(radius), where=radius > 0.0)
+        return np.stack([x * scale, y * scale, np.cos(angle)], axis=-1), radius <= self._radius(np.array(self.largest))
+
+    rays_of_picture = rays
+
+    def _radius(self, theta: np.ndarray) -> np.ndarray:
+        """Return the radius at which the lens shows an angle from the axis."""
+        return theta * np.polyval(self.powers[::-1], theta * theta)
 
 
 def _distance(a: Points, b: Points) -> np.ndarray:
     return np.hypot(a[0] - b[0], a[1] - b[1])
 
 
-def _interpolated(nodes: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return values at all pixels from values at the crossings of some rows and columns, bilinear."""
-    along = np.stack([np.interp(np.arange(shape[1]), columns, each) for each in nodes])
-    cell = np.clip(np.searchsorted(rows, np.arange(shape[0]), "right") - 1, 0, max(len(rows) - 2, 0))
-    last = np.minimum(cell + 1, len(rows) - 1)
-    share = ((np.arange(shape[0]) - rows[cell]) / np.maximum(rows[last] - rows[cell], 1))[:, None]
-    return along[cell] * (1.0 - share) + along[last] * share
+def _at_depth_1(points: Points, exists: np.ndarray) -> Rays:
+    out = np.empty((*exists.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = *points, 1.0
+    return out, exists

@@ -5,10 +5,9 @@
 >>> depth, faces = sensor.depth(hits), sensor.picture(hits.prim_id)
 """
 
-from wrt.scene.sensors.cameras import fisheye, pinhole, project, unproject
-from wrt.scene.sensors.lidars import LIDARS, LidarModel, lidar, raster_lidar, rotating_lidar
-from wrt.scene.sensors.noise import with_range_noise
-from wrt.scene.sensors.sensor import Sensor
+from wrt.sensors.cameras import fisheye, pinhole, project, unproject
+from wrt.sensors.lidars import LIDARS, LidarModel, lidar, raster_lidar, rotating_lidar, with_range_noise
+from wrt.sensors.sensor import Sensor
 
 __all__ = ["LIDARS", "LidarModel", "Sensor", "fisheye", "lidar", "pinhole", "project", "raster_lidar", "rotating_lidar", "unproject",
            "with_range_noise"]

@@ -1,1 +1,0 @@
-"""Sensors as arrays of rays: poses, cameras with lens distortion, LiDARs, noise. `wrt.sensors` has the public names."""
