@@ -15,7 +15,7 @@ def use(name: str, *, real: bool = False, seed: int = 0) -> None:
 
     real: use a GPU of this machine instead of a virtual GPU (tests/virtual_gpu), whose threads run in an order drawn by `seed`."""
     global NAME, IS_VIRTUAL
-    assert "wrt.core.default_device" not in sys.modules
+    assert "wrt.core.settings" not in sys.modules
     os.environ["WRT_DEVICE"] = name  # for processes that tests start, too
     if not real:
         from tests.virtual_gpu import install

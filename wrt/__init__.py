@@ -132,10 +132,9 @@ def __getattr__(name: str) -> Any:
 def _hint(name: str) -> str:
     """Return where an unknown name is, or the most similar public name; "" without either."""
     from wrt.core.checks import did_you_mean
-    from wrt.core.other_names import same_name
 
-    if (ours := same_name(name, ELSEWHERE) or name) in ELSEWHERE:
-        return f"use {ELSEWHERE[ours]}"
+    if name in ELSEWHERE:
+        return f"use {ELSEWHERE[name]}"
     for place in ("wrt.sensors", "wrt.scene.shapes"):
         if callable(getattr(importlib.import_module(place), name, None)):
             return f"use {place}.{name}"

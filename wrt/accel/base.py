@@ -23,11 +23,10 @@ from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.accel.tree_exchange import TreeExchange
 from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers
-from wrt.core.building import report_parts
-from wrt.core.default_device import DEFAULT_DEVICE
+from wrt.core.building import build_clock, report_parts
 from wrt.core.device import upload
 from wrt.core.errors import InputError
-from wrt.core.seconds import build_clock
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units

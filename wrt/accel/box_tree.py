@@ -12,9 +12,8 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError
-from wrt.core.files import require_file
+from wrt.core.files import require_file, write_bytes
 from wrt.core.types import PathLike
-from wrt.core.write_file import write_bytes
 
 MOST_CHILDREN = 8
 MAX_LEAF = 64  # primitives

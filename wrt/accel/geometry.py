@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.triangle_data import LAYOUTS
-from wrt.core.checked_file import checksum_of
 from wrt.core.device import records, upload
+from wrt.core.files import checksum_of
 from wrt.core.threads import run_all
 from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.traverse.common import Units

@@ -20,11 +20,11 @@ from wrt.accel.store import save_instances
 from wrt.accel.structure import Structure
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, widen, world_boxes
 from wrt.core.arrays import real_numbers, to_warp
+from wrt.core.building import build_clock
 from wrt.core.checks import shown
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
-from wrt.core.seconds import build_clock
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.types import ArrayLike, PathLike, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units

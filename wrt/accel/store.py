@@ -6,7 +6,6 @@ them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,12 @@ from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.checks import as_one
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import aligned, row_type
 from wrt.core.errors import InputError
-from wrt.core.threads import thread_count, verifying
+from wrt.core.files import check_writable, replacing
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.types import JsonObject, PathLike
 from wrt.core.version import VERSION
-from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
@@ -99,9 +97,8 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
 
     Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
-    at_once = thread_count(threads)
     try:
-        with (read_checked(path, MAGIC, "acceleration structure", at_once) as (header, body),
+        with (read_checked(path, MAGIC, "acceleration structure") as (header, body),
               np.errstate(over="ignore", invalid="ignore")):  # for values near the largest float32
             cls = ACCELERATORS.get(header["accel"])
             if cls is None:
@@ -117,9 +114,9 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
                     raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
                 attributes = scene_of(arrays)
                 geometry = mesh_of(attributes)
-            with verifying(partial(require_same_mesh, header, geometry), at_once):
-                built = read_arrays(cls, header, body)
-                return cls.restore(built, geometry, attributes, device, threads, units=units)
+            require_same_mesh(header, geometry)
+            built = read_arrays(cls, header, body)
+            return cls.restore(built, geometry, attributes, device, threads, units=units)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise (error if error.path else error.at(path)) from error

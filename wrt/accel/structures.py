@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from wrt.core import cuda
+from wrt.core import settings
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
@@ -42,4 +42,4 @@ ACCELERATORS = Structures("structure", {
 
 def stack_on(device: str) -> str:
     """Return where kernels on a device have their traversal stacks: a name in kernels.traverse.stack.PLACES."""
-    return "local" if device == "cpu" else cuda.stack  # a CPU has no other place
+    return "local" if device == "cpu" else settings.stack  # a CPU has no other place

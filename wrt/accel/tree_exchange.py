@@ -11,9 +11,9 @@ from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.structure import Structure
-from wrt.core.default_device import DEFAULT_DEVICE
+from wrt.core.building import build_clock
 from wrt.core.errors import InputError
-from wrt.core.seconds import build_clock
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.kernels.traverse.common import Units
 
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import click
 
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError, SceneWarning
+from wrt.core.settings import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem

@@ -22,7 +22,7 @@ PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; writ
 def inspect(scene: Path, output: Path | None, view: str, assignments: Assignments, quiet: bool, as_json: bool, **options: Parsed) -> None:
     """Print the tree of rays of a pixel of SCENE. It has what each ray hits, why it ends, and what it adds to the pixel."""
     from wrt.core.checks import as_choice
-    from wrt.core.write_file import check_writable
+    from wrt.core.files import check_writable
     from wrt.renderer.inspector.drawing import VIEWS, require_drawable
     from wrt.renderer.inspector.inspect import inspect as inspect_pixel
 

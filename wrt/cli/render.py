@@ -32,9 +32,9 @@ from wrt.cli.common import (
     shared,
     warnings_reported,
 )
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, held_interrupts
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.io.meshes import SUFFIXES
 
 if TYPE_CHECKING:

@@ -29,8 +29,8 @@ from wrt.cli.common import (
     warnings_reported,
 )
 from wrt.core.errors import InputError
+from wrt.core.files import check_writable, write_bytes
 from wrt.core.interrupts import exit_code
-from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 from wrt.renderer.progress import TimeLeft
 

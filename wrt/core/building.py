@@ -1,6 +1,7 @@
-"""Progress of a build: builders report the finished share to the function that the caller of `wrt.build` gave."""
+"""Progress and time of a build: builders report the finished share to the function that the caller of `wrt.build` gave."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -9,6 +10,7 @@ from typing import TypeVar
 T = TypeVar("T")
 R = TypeVar("R")
 _report: ContextVar[Callable[[float], None]] = ContextVar("report", default=lambda done: None)
+_here = threading.local()  # loaded: seconds that this thread spent on loading kernels
 
 
 @contextmanager
@@ -52,3 +54,18 @@ def tally(total: int) -> Callable[[int], None]:
             whole(done / max(total, 1))
 
     return add
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Mark the loading of a kernel: compiling it, reading it from the cache, or waiting for another thread that does."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        _here.loaded = getattr(_here, "loaded", 0.0) + time.perf_counter() - begin
+
+
+def build_clock() -> float:
+    """Return the seconds of a clock that stops while this thread loads kernels. Only differences are meaningful."""
+    return time.perf_counter() - getattr(_here, "loaded", 0.0)

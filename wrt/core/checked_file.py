@@ -11,22 +11,12 @@ from zlib import crc32
 
 import numpy as np
 
-from wrt.core.errors import InputError
-from wrt.core.files import open_regular
-from wrt.core.threads import verifying
+from wrt.core.errors import InputError, at
+from wrt.core.files import read_file
 from wrt.core.types import JsonObject
 
 CHECKSUM_BYTES = 4
 MAX_HEADER = 1 << 16
-
-
-def checksum_of(*arrays: np.ndarray) -> int:
-    """Return the CRC-32 of arrays: of their shapes, types and bytes."""
-    checksum = 0
-    for array in arrays:
-        head = f"{array.shape}{array.dtype.str}".encode()
-        checksum = crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, crc32(head, checksum))
-    return checksum
 
 
 def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Iterable[bytes | np.ndarray]) -> None:
@@ -45,32 +35,19 @@ def is_whole(data: memoryview) -> bool:
 
 
 @contextmanager
-def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads: int = 1) -> Iterator[tuple[JsonObject, memoryview]]:
-    """Yield the header and the bytes of the arrays. With two threads or more, the checksum is verified while the block runs.
-
-    Raises InputError if the file is missing, damaged, or not of the kind `what`: if it is damaged, in place of any error of the block."""
-    try:
-        with open_regular(path) as file:
-            if file.read(len(magic)) != magic:
-                raise InputError(f"is no {what} of this version")
-            file.seek(0)
-            data = np.empty(os.fstat(file.fileno()).st_size, np.uint8).data  # in huge pages: half of the time of `bytes`
-            data = data[:file.readinto(data)]
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    except InputError as error:
-        raise error.at(path) from error
-    end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
-
-    def verify() -> None:
-        if end < 0 or not is_whole(data):
-            raise InputError("is damaged: its checksum does not match its content", path=path)
-
-    with verifying(verify, threads):
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> Iterator[tuple[JsonObject, memoryview]]:
+    """Yield the header and the bytes of the arrays. Raises InputError if the file is missing, damaged, or not of the kind `what`."""
+    with at(path=path):
+        data = memoryview(read_file(path))
+        if not data[:len(magic)] == magic:
+            raise InputError(f"is no {what} of this version")
+        if not is_whole(data):
+            raise InputError("is damaged: its checksum does not match its content")
+        end = bytes(data[:len(magic) + MAX_HEADER]).find(b"\n", len(magic))
         try:
             header = json.loads(bytes(data[len(magic):end]))
         except (ValueError, RecursionError):
             header = None
         if not isinstance(header, dict):
-            raise InputError(f"is no {what} of this version", path=path)
-        yield header, data[end + 1:-CHECKSUM_BYTES]
+            raise InputError(f"is no {what} of this version")
+    yield header, data[end + 1:-CHECKSUM_BYTES]

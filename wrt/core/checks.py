@@ -4,17 +4,19 @@ import difflib
 import operator
 import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import fields
+from functools import wraps
+from inspect import Parameter, signature
 from itertools import islice
 from pathlib import Path
 from types import UnionType
-from typing import TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
 
 from wrt.core.errors import InputError, wrong
-from wrt.core.other_names import same_name
 
 T = TypeVar("T")
 LARGEST = 1e30  # largest absolute value of a number in a scene; float32 ends at 3.4e38
@@ -115,9 +117,8 @@ def listed(names: Collection[str], most: int = 5) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return "did you mean ...? " with the known name that means the same or is most similar; "" if none is."""
-    names = list(islice(known, 1000))
-    near = same_name(name, names) or most_similar(name, names) if isinstance(name, str) else ""
+    """Return "did you mean ...? " with the known name that is most similar; "" if none is."""
+    near = most_similar(name, known) if isinstance(name, str) else ""
     return f"did you mean {near!r}? " if near else ""
 
 
@@ -125,6 +126,32 @@ def most_similar(name: str, known: Iterable[str]) -> str:
     """Return the known name that is most similar to `name`; "" if none is similar."""
     names = [each for each in islice(known, 1000) if len(each) <= 100]
     return next(iter(difflib.get_close_matches(name[:100], names, n=1)), "")
+
+
+def parameters_of(function: Callable[..., object], *more: str) -> list[str]:
+    """Return the names of the keywords of a function: its parameters, with `more` in place of `**`."""
+    return [*more, *(name for name, each in signature(function).parameters.items() if each.kind is not Parameter.VAR_KEYWORD)]
+
+
+def check_keywords(function: str, keywords: Iterable[str], known: Collection[str]) -> None:
+    """Raise TypeError for a keyword that a function does not know, with the known one that is most similar."""
+    for name in keywords:
+        if name not in known:
+            near = did_you_mean(name, known).rstrip()
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}{near and '; ' + near}")
+
+
+def suggest_fields(cls: type[T]) -> type[T]:
+    """Let a dataclass answer an unknown keyword with the field that is most similar, as `check_keywords` does."""
+    known, init = [each.name for each in fields(cls)], cls.__init__  # type: ignore[arg-type]
+
+    @wraps(init)
+    def __init__(self: T, *args: Any, **keywords: Any) -> None:
+        check_keywords(cls.__name__, keywords, known)
+        init(self, *args, **keywords)
+
+    cls.__init__ = __init__  # type: ignore[method-assign, assignment]
+    return cls
 
 
 def at_thing(kind: str, name: str) -> str:

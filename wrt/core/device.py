@@ -1,9 +1,7 @@
 """Start of Warp, loading and launching of kernels, and copies of arrays to and from a device."""
 
 import contextlib
-import errno
 import os
-import shutil
 import sys
 import tempfile
 import threading
@@ -20,17 +18,14 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.core import cuda, warp_private
-from wrt.core.compiling import WATCH
+from wrt.core import settings, warp_private
+from wrt.core.building import loading
+from wrt.core.compiling import WATCH, is_intact, remove
 from wrt.core.errors import InputError, warn
-from wrt.core.kernel_cache import is_intact, remove
-from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
 
 MOST_ROWS = (1 << 31) - 1
-ROOM_TO_COMPILE = 16 << 20  # bytes of disk for the sources and the object of a kernel, with a large margin
-FILES_TO_COMPILE = 64  # files and folders of a kernel, with a large margin
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default; another level is the user's
     wp.config.log_level = wp.LOG_WARNING
@@ -61,19 +56,23 @@ def made_once(make: Callable[P, T]) -> Callable[P, T]:
     return cached  # type: ignore[return-value]
 
 
+@made_once
+def _start_warp() -> None:
+    if not os.environ.get("WARP_CACHE_PATH"):
+        os.environ.pop("WARP_CACHE_PATH", None)  # empty: Warp would keep its kernels in the current folder
+    with _cache_errors(), _without_driver_message():
+        wp.init()
+        warp_private.prepare()
+
+
 @contextmanager
-def _stderr_without(text: bytes) -> Iterator[None]:
-    """Remove lines that contain `text` from what the block writes to file descriptor 2: Warp's C++ code bypasses sys.stderr."""
-    try:
-        buffer = tempfile.TemporaryFile()
-    except OSError:
-        buffer = None
-    if buffer is None or sys.stderr is None:  # no temporary file, or the caller closed stderr
+def _without_driver_message() -> Iterator[None]:
+    """Remove Warp's line about a missing GPU from what the block writes to file descriptor 2, which C++ code writes to directly."""
+    if sys.stderr is None:
         yield
         return
-    sys.stderr.flush()
-    with buffer:
-        stderr = os.dup(2)
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile("w+") as buffer:
         os.dup2(buffer.fileno(), 2)
         try:
             yield
@@ -81,18 +80,7 @@ def _stderr_without(text: bytes) -> Iterator[None]:
             os.dup2(stderr, 2)
             os.close(stderr)
             buffer.seek(0)
-            if lines := b"".join(line for line in buffer.read().splitlines(keepends=True) if text not in line):
-                with contextlib.suppress(OSError):  # a full disk
-                    os.write(2, lines)
-
-
-@made_once
-def _start_warp() -> None:
-    with _stderr_without(warp_private.NO_DRIVER), _cache_errors():  # Warp reports a missing GPU at each start
-        if not os.environ.get("WARP_CACHE_PATH"):
-            os.environ.pop("WARP_CACHE_PATH", None)  # empty: Warp would keep its kernels in the current folder
-        wp.init()
-        warp_private.prepare()
+            sys.stderr.writelines(line for line in buffer if warp_private.NO_DRIVER not in line)
 
 
 def start(device: str) -> Device:
@@ -108,8 +96,7 @@ def start(device: str) -> Device:
 def _device(device: str) -> Device:
     _start_warp()
     try:
-        with _stderr_without(warp_private.CUDA_ERROR):  # the InputError below reports it
-            return wp.get_device(device)
+        return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
         raise InputError(f"no device {device!r}", argument="device", hint=f"there is {known}") from error
@@ -126,17 +113,14 @@ def describe_devices() -> list[str]:
 
 def block_dim(device: Device) -> int:
     """Return the number of threads in a block; on the CPU always 1, as Warp would compile a kernel anew for each block size."""
-    return 1 if device.is_cpu else cuda.block_dim
+    return 1 if device.is_cpu else settings.block_dim
 
 
 def memory_of(device: Device) -> float:
     """Return the free bytes of a GPU, or all bytes of main memory for the CPU; infinite if the system does not report them."""
     if device.is_cuda:
         return float(device.free_memory)
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")
 
 
 class _Loaded:
@@ -200,7 +184,6 @@ def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
         for path in before:  # files that another process has compiled since stay
             remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        _require_room_to_compile(folder.parent)
         with WATCH.compiling():
             warp_private.load(kernel, device, block_dim)
 
@@ -216,20 +199,6 @@ def _cache_errors() -> Iterator[None]:
         reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
         raise InputError(f"kernels cannot be compiled: {reason}", hint="set WARP_CACHE_PATH to another folder",
                          path=wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
-
-
-def _require_room_to_compile(cache: Path) -> None:
-    """Raise OSError if the disk has no room to compile a kernel: LLVM ends the process on a full disk."""
-    room = float(shutil.disk_usage(cache).free)
-    with contextlib.suppress(ImportError):
-        import resource
-
-        most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-        room = min(room, float("inf") if most == resource.RLIM_INFINITY else most)
-    if room < ROOM_TO_COMPILE:
-        raise OSError(errno.ENOSPC, f"there is room for {room / 2**20:.1f} MiB, but {ROOM_TO_COMPILE >> 20} MiB are needed")
-    if hasattr(os, "statvfs") and (disk := os.statvfs(cache)).f_files and disk.f_favail < FILES_TO_COMPILE:
-        raise OSError(errno.ENOSPC, f"there is room for {disk.f_favail} files, but {FILES_TO_COMPILE} are needed")
 
 
 def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool = False) -> WarpArray:
@@ -328,7 +297,7 @@ def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: 
     """Launch a kernel over n elements.
 
     With a step, the CPU launches the kernel once for each range of `step` elements, on `threads` threads. An input of None is replaced
-    by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.cuda.block_dim threads."""
+    by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.settings.block_dim threads."""
     if n == 0:
         return
     warp_private.refuse_capture()

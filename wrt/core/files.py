@@ -1,58 +1,105 @@
-"""Reading of untrusted files."""
+"""Files: reading of untrusted files, and writing that replaces a file only by a complete one.
+
+A new file is written beside its target and renamed to it, so that a link at the target is replaced and never followed. A killed process
+leaves its temporary file, `.wrt-*` (docs/long_renders.md)."""
 
 import codecs
+import contextlib
 import os
 import stat
-from io import BufferedReader
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
+from zlib import crc32
+
+import numpy as np
 
 from wrt.core.errors import InputError
 
-
-def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
-    """Open a regular file for reading.
-
-    Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end. Raises OSError like `open`."""
-    try:
-        # Without O_NONBLOCK, opening a pipe waits until something writes to it.
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    except ValueError as error:  # a name with a zero byte in it
-        raise InputError(f"cannot be read: {error}") from None
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
-        os.close(descriptor)
-        raise InputError(f"cannot be read: {'Is a directory' if stat.S_ISDIR(mode) else 'no regular file'}")
-    return open(descriptor, "rb")
+BAD_NAMES = OSError, ValueError  # of names that the system does not have, and of names that no system takes
 
 
 def require_file(path: Path, what: str = "") -> None:
-    """Raise InputError if there is no file at the path, or if the system cannot tell. what: end of the message."""
-    try:
-        there = path.exists()
-    except OSError as error:  # a name too long, a folder that may not be looked into
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from None
-    if not there:
-        raise InputError(f"no such file{what}", path=path)
+    """Raise InputError if there is no file at the path. what: end of the message."""
+    with _reported(path, "read"):
+        if not path.exists():
+            raise InputError(f"no such file{what}", path=path)
 
 
-def read_file(path: str | os.PathLike[str]) -> bytes:
-    """Return all bytes of a regular file. Raises InputError, without the path, if it cannot be read."""
-    try:
-        with open_regular(path) as file:
-            return file.read(os.fstat(file.fileno()).st_size)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}") from None
+def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
+    """Return the bytes of a regular file, or the first `most` of them.
+
+    Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end."""
+    with _reported(None, "read", BAD_NAMES):
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise InputError("cannot be read: it is no regular file")
+        with open(path, "rb") as file:
+            return file.read(most)
 
 
 def utf8(text: bytes) -> bytes:
-    """Return a text file's bytes as UTF-8 without a byte order mark; a mark of UTF-16 or UTF-32 tells the file's encoding.
-
-    Raises InputError, without the path, for text that is damaged.
-    """
-    for marks, encoding in (((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"), ((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16")):
-        if text.startswith(marks):
-            try:
-                return text.decode(encoding).encode()
-            except UnicodeError as error:
-                raise InputError(f"is damaged {encoding.upper()} text ({error})", hint="save it as UTF-8") from None
+    """Return a text file's bytes without a byte order mark. Raises InputError, without the path, for text in UTF-16 or UTF-32."""
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
+        raise InputError("is text in UTF-16 or UTF-32", hint="save it as UTF-8")
     return text.removeprefix(codecs.BOM_UTF8)
+
+
+def checksum_of(*arrays: np.ndarray) -> int:
+    """Return the CRC-32 of arrays: of their shapes, types and bytes."""
+    checksum = 0
+    for array in arrays:
+        head = f"{array.shape}{array.dtype.str}".encode()
+        checksum = crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, crc32(head, checksum))
+    return checksum
+
+
+def check_writable(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path. Raises InputError if `replacing` cannot write a file there: callers ask before long work."""
+    target = Path(path).absolute()  # the current folder may change
+    with _reported(path, "written", BAD_NAMES):
+        is_there = os.access(target, os.F_OK)  # raises ValueError for names that no system takes; Path.exists() hides it
+        wrong = ("its folder does not exist" if not target.parent.is_dir() else "is a folder" if target.is_dir()
+                 else "is no regular file" if is_there and not target.is_file()  # a device: replacing it would destroy its node
+                 else "is write-protected" if is_there and not os.access(target, os.W_OK)
+                 else "its folder is write-protected" if not os.access(target.parent, os.W_OK) else "")
+    if wrong:
+        raise InputError(wrong, path=path)
+    return target
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write `data` to a file by `replacing`."""
+    with replacing(path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a new file in the folder of `path` for reading and writing; after the block, rename it to `path`.
+
+    After any failure the new file is removed, and an existing file at `path` is unchanged. Raises InputError if the system refuses."""
+    target = check_writable(path)
+    # With the suffix of the target, by which OpenImageIO chooses the format. Files of tempfile would be readable by the user alone.
+    temporary = target.with_name(f".wrt-{uuid.uuid4().hex}{target.suffix}")
+    with _reported(path, "written"):
+        try:
+            with open(temporary, "x+b") as file:  # Windows renames only closed files
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextlib.contextmanager
+def _reported(path: str | os.PathLike[str] | None, what: str, kinds: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
+    """Turn an error of the system in the block into an InputError. what: "read" or "written"."""
+    try:
+        yield
+    except InputError:
+        raise
+    except kinds as error:
+        raise InputError(f"cannot be {what}: {getattr(error, 'strerror', None) or error}", path=path) from error

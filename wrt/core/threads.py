@@ -1,12 +1,12 @@
 """CPU threads: their number, the size of their stacks, and tasks on them."""
 
-import contextlib
 import operator
 import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache, partial
 from typing import Generic, ParamSpec, TypeVar
 
@@ -19,6 +19,7 @@ STACK = 2 << 20
 P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
+_here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def thread_count(threads: int | None) -> int:
@@ -32,18 +33,15 @@ def thread_count(threads: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-# --- stacks ------------------------------------------------------------------------------------------------------------
-
-
 @cache
 def _stack_limit() -> float:
     """Return the bytes of the main thread's stack, or infinity if unknown. New threads have the same if threading.stack_size() is 0."""
-    with contextlib.suppress(ImportError):
+    try:
         import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_STACK)[0]
-        return float("inf") if limit == resource.RLIM_INFINITY else limit
-    return float("inf")
+    except ImportError:
+        return float("inf")
+    limit = resource.getrlimit(resource.RLIMIT_STACK)[0]
+    return float("inf") if limit == resource.RLIM_INFINITY else limit
 
 
 @cache
@@ -52,11 +50,11 @@ def _stack_size_lock(process: int) -> threading.Lock:
     return threading.Lock()
 
 
-@contextlib.contextmanager
+@contextmanager
 def _large_stacks() -> Iterator[bool]:
     """Give threads that start in the block stacks of STACK bytes or more. Yield True if the default stack is that large.
 
-    Otherwise threads that the user starts meanwhile get large stacks, too: threading.stack_size() holds for the whole process."""
+    threading.stack_size() holds for the whole process, and each call sets it."""
     with _stack_size_lock(os.getpid()):
         before = threading.stack_size(STACK)
         large = (before or _stack_limit()) >= STACK
@@ -67,9 +65,6 @@ def _large_stacks() -> Iterator[bool]:
         finally:
             if not large:
                 threading.stack_size(before)
-
-
-_here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def _has_stack() -> bool:
@@ -83,37 +78,15 @@ def _has_stack() -> bool:
     return bool(_here.large)
 
 
-def with_stack(task: Callable[[], T]) -> T:
-    """Run a task that runs or compiles kernels; on another thread if the stack of this thread is small.
-
-    On a small stack, kernels and the compiler end the process with a segmentation fault."""
-    return task() if _has_stack() else submit(task).result()
-
-
-# --- tasks -------------------------------------------------------------------------------------------------------------
-
-
 class Pool(ThreadPoolExecutor):
-    """Pool of threads with large stacks, which start when they are needed and stay.
-
-    The standard pool refuses tasks after the end of Python's main thread. This pool then runs a task at once in the thread that submits
-    it, or raises InputError if the stack of that thread is small."""
+    """Pool of threads with large stacks, which start when they are needed and stay."""
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
         super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
 
     def submit(self, task: Callable[P, T], /, *arguments: P.args, **named: P.kwargs) -> Future[T]:
-        if threading.main_thread().is_alive():
-            with _large_stacks():
-                return super().submit(task, *arguments, **named)
-        if not _has_stack():
-            raise InputError("Python's main thread has ended, and the stack of this thread is too small for kernels")
-        future = Future[T]()
-        try:
-            future.set_result(task(*arguments, **named))
-        except BaseException as error:
-            future.set_exception(error)
-        return future
+        with _large_stacks():
+            return super().submit(task, *arguments, **named)
 
 
 @cache
@@ -127,14 +100,11 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
     return _pool(os.getpid()).submit(task, *arguments, **named)
 
 
-@contextlib.contextmanager
-def verifying(check: Callable[[], object], threads: int) -> Iterator[None]:
-    """Run `check` on another thread while the block runs; if `threads` is 1, after it. Raise its error in place of the block's."""
-    end = submit(check).result if threads > 1 else check
-    try:
-        yield
-    finally:
-        end()
+def with_stack(task: Callable[[], T]) -> T:
+    """Run a task that runs or compiles kernels; on another thread if the stack of this thread is small.
+
+    On a small stack, kernels and the compiler end the process with a segmentation fault."""
+    return task() if _has_stack() else submit(task).result()
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
@@ -202,9 +172,6 @@ def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], It
                 waiting.extend(after())
     finally:
         wait(running)
-
-
-# --- things that one thread uses at a time -------------------------------------------------------------------------
 
 
 class FreeList(Generic[T]):

@@ -19,8 +19,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
+from wrt.core.compiling import seal, shared_headers
 from wrt.core.errors import InputError
-from wrt.core.kernel_cache import seal, shared_headers
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 
 WORKS_WITH = "warp-lang>=1.19,<1.20"  # as in pyproject.toml
@@ -166,8 +166,7 @@ def refuse_capture(device: Device | None = None) -> None:
 IN_CACHE = "wp_*"  # folders of modules in the kernel cache
 # Folders that killed processes leave in the cache: unfinished compilations; precompiled headers of wrt or of older versions of Warp.
 LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
-# Texts in lines that Warp's C++ code writes to file descriptor 2.
-NO_DRIVER, CUDA_ERROR = b"NVIDIA CUDA driver", b"Warp CUDA error"
+NO_DRIVER = "NVIDIA CUDA driver"  # in the line that Warp's C++ code writes to file descriptor 2 at each start without a GPU
 
 
 def is_own(kernel: Kernel) -> bool:
@@ -326,7 +325,7 @@ def _compile_well() -> None:
                 compile_object(str(folder / "empty.o"), str(folder / "empty.cpp"), **{**options, "pch_dir": str(folder)})
 
             try:
-                options["pch_dir"] = str(shared_headers(_headers_key(options), precompile, LEFTOVER))
+                options["pch_dir"] = str(shared_headers(Path(wp.config.kernel_cache_dir), _headers_key(options), precompile, LEFTOVER))
             except OSError:  # the cache is read-only, and the kernel is compiled in another folder
                 options["pch_dir"] = own_headers()
         compile_object(obj_path, cpp_path, **options)

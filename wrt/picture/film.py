@@ -11,7 +11,6 @@ import numpy as np
 
 from wrt.core.checks import as_names, require_known
 from wrt.core.errors import InputError
-from wrt.core.suggestions import Suggests
 from wrt.core.types import PathLike, WarpArray
 from wrt.picture.image import as_half, check_writable, color_channels, encode_png, output_format, write_codes, write_exr, write_image
 from wrt.picture.tonemap import to_codes
@@ -21,7 +20,7 @@ LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 
 @dataclass(eq=False)
-class Film(Suggests):
+class Film:
     """The result of `render`. A film keeps the arrays that it is given.
 
     The results of `np.asarray(film)`, of any library's `from_dlpack(film)`, of `numpy()` and of `warp()` share the memory of the pixels.

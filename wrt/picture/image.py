@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core import write_file
+from wrt.core import files
 from wrt.core.errors import InputError, at, warn
-from wrt.core.files import open_regular, read_file
+from wrt.core.files import read_file, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
-from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
 from wrt.picture.decode import check_size, decode_png16, decode_rgba8
 from wrt.picture.radiance import read_hdr
@@ -60,7 +59,7 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
 def check_writable(path: PathLike, bits: int | None = None) -> None:
     """Raise InputError before any work if an image cannot be written to `path`."""
     output_format(path, bits)
-    write_file.check_writable(path)
+    files.check_writable(path)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -94,7 +93,7 @@ def write_codes(path: PathLike, codes: np.ndarray, metadata: Metadata | None = N
     kind = {".webp": "WEBP", ".png": "PNG"}.get(Path(path).suffix.lower(), "JPEG")
     with at(path=path):
         data = encode_png(codes, metadata) if kind == "PNG" else _encode_lossy(codes, kind, metadata or {})
-    write_file.write_bytes(path, data)
+    files.write_bytes(path, data)
 
 
 def _encode_lossy(codes: np.ndarray, kind: str, metadata: Metadata) -> bytes:
@@ -318,12 +317,7 @@ def _read(source: Any, *where: Any) -> np.ndarray:
 @contextlib.contextmanager
 def _opened(path: PathLike, suffix: str) -> Iterator[Any]:
     """Open an EXR or HDR file in OpenImageIO. The first bytes are checked before, because OpenImageIO would try every format."""
-    try:
-        with open_regular(path) as file:
-            first = file.read(16)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}") from error
-    if not first.startswith(_MAGIC[suffix]):
+    if not read_file(path, 16).startswith(_MAGIC[suffix]):
         raise InputError(f"cannot be read as an image: it is no {suffix} file")
     oiio = _oiio()
     oiio.attribute("try_all_readers", 0)

@@ -10,8 +10,8 @@ import numpy as np
 
 from wrt.core.checks import as_integer
 from wrt.core.errors import InputError
+from wrt.core.files import check_writable, replacing
 from wrt.core.packages import needed_by
-from wrt.core.write_file import check_writable, replacing
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer

@@ -1,4 +1,4 @@
-"""Checkpoints of long renders: the film in a file, which is replaced as a whole, so that it is never incomplete (wrt.core.write_file).
+"""Checkpoints of long renders: the film in a file, which is replaced as a whole, so that it is never incomplete (wrt.core.files).
 
 A checkpoint is a file with checksums (wrt.core.checked_file). It contains the identity of its render (everything that can change a
 pixel), the progress, and the film's arrays with the number of samples of each pixel. A render can resume from any state between two
@@ -17,8 +17,8 @@ import numpy as np
 
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
+from wrt.core.files import check_writable, replacing
 from wrt.core.version import VERSION
-from wrt.core.write_file import check_writable, replacing
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan

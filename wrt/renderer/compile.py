@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 
 from wrt.accel.scenes.build import build
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import load_kernel, start
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.threads import run_all
 from wrt.core.warp_private import short_name
 from wrt.renderer.film_arrays import OF_AOVS

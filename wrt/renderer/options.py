@@ -15,9 +15,9 @@ from wrt.accel.scenes.instancing import INSTANCING
 from wrt.accel.structure import check_units
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import start
 from wrt.core.errors import InputError
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.threads import thread_count
 from wrt.picture.film import Film
 from wrt.scene.cameras import CameraKind

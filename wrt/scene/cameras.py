@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypedDict, Unpack
 
 import numpy as np
 
-from wrt.core.checks import at_thing
+from wrt.core.checks import at_thing, suggest_fields
 from wrt.core.errors import InputError, wrong
-from wrt.core.suggestions import suggest_fields, suggest_keywords
 from wrt.core.types import ArrayLike
 from wrt.scene.kinds import Record, check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
@@ -59,7 +58,6 @@ class CameraKind:
         return camera
 
     @classmethod
-    @suggest_keywords
     def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0), **fields: Any) -> Self:
         """Return a camera at `position` that looks at `target`.
 

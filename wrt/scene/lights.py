@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wrt.core.checks import at_thing
+from wrt.core.checks import at_thing, suggest_fields
 from wrt.core.errors import wrong
-from wrt.core.suggestions import suggest_fields
 from wrt.scene.kinds import Kind, Record, given
 from wrt.scene.values import ROUNDING, Color, as_number
 

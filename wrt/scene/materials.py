@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_choice, at_thing
+from wrt.core.checks import LARGEST, as_array, as_choice, at_thing, suggest_fields
 from wrt.core.errors import wrong
-from wrt.core.suggestions import suggest_fields
 from wrt.scene.kinds import check_fields, forms, given
 from wrt.scene.values import BLACK, Color
 

@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wrt.core.checked_file import checksum_of
-from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
+from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown, suggest_fields
 from wrt.core.errors import InputError
+from wrt.core.files import checksum_of, write_bytes
 from wrt.core.packages import needed_by
-from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
-from wrt.core.write_file import write_bytes
 from wrt.scene.clean import has_area, require_indices
 from wrt.scene.values import as_vector, near_zero, warn_if_far
 

@@ -17,10 +17,9 @@ from typing import Any, Self, Unpack
 
 import numpy as np
 
-from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, unknown
+from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, suggest_fields, unknown
 from wrt.core.errors import InputError, wrong
 from wrt.core.registry import Registry
-from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind

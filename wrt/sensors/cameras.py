@@ -9,7 +9,6 @@ import numpy as np
 from wrt.core.arrays import given_like
 from wrt.core.checks import as_size, shown
 from wrt.core.errors import InputError
-from wrt.core.suggestions import suggest_keywords
 from wrt.core.types import ArrayLike
 from wrt.sensors.lenses import Fisheye, Radial
 from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
@@ -17,7 +16,6 @@ from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
 Lens = Radial | Fisheye
 
 
-@suggest_keywords
 def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
             rolling: bool = False, like: object = None) -> Sensor[Any]:
     """Make one ray through the centre of each pixel of a pinhole camera.

@@ -19,8 +19,8 @@ import warp as wp
 import wrt
 from tests.placed import place
 from wrt.accel.geometry import Geometry
-from wrt.core.cuda import STACKS
 from wrt.core.device import launch_on
+from wrt.core.settings import STACKS
 from wrt.kernels.headers import STACK_LENGTH
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import ENTRY
@@ -74,7 +74,7 @@ def test_no_other_vector_of_device_code_has_the_length_of_a_stack() -> None:
 def test_get_returns_what_put_stored_and_threads_do_not_share(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     out = wp.zeros((THREADS, SIZE), dtype=wp.uint64, device=DEVICE)
     places = wp.zeros(THREADS, dtype=wp.uint64, device=DEVICE)
-    monkeypatch.setattr("wrt.core.cuda.block_dim", BLOCK)
+    monkeypatch.setattr("wrt.core.settings.block_dim", BLOCK)
     launch_on(DEVICE, make_probe_kernel(where), THREADS, out, places, None)
     expected = 1000 * np.arange(THREADS)[:, None] + np.arange(SIZE)
     expected[:, 3] = 7
@@ -106,7 +106,7 @@ def test_walks_find_the_same_hits_with_either_stack(name: str, entry: int, insta
     deepest = np.asarray(here.closest_hit(*rays, counters=True).counters.stack)
     assert (hits.prim_id >= 0).any() and occluded.any() and not occluded.all() and (deepest > SHARED // entry).mean() > 0.1
     for stack in STACKS:
-        monkeypatch.setattr("wrt.core.cuda.stack", stack)
+        monkeypatch.setattr("wrt.core.settings.stack", stack)
         found = there.closest_hit(*rays)
         assert (there.any_hit(*rays, 0.0, ends) == occluded).all()
         for field in ("t", "u", "v", "prim_id"):

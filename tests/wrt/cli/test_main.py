@@ -257,23 +257,6 @@ def test_a_wrong_output_is_reported_before_the_scene_is_read(output: str, messag
     assert new_files() == {"folder.png"}
 
 
-@contextmanager
-def unwritable_folder() -> Iterator[Path]:
-    """Yield a folder without write permission: for root, /proc."""
-    if os.geteuid() != 0:
-        Path("closed").mkdir(mode=0o555)
-        yield Path("closed")
-    elif Path("/proc/self").is_dir():
-        yield Path("/proc")
-    else:
-        pytest.skip("root may write everywhere")
-
-
-def test_an_output_folder_that_cannot_be_written_to(unreadable: None) -> None:
-    with unwritable_folder() as closed:
-        refused(run("render", "box.obj", "-o", closed / "a.png"), f"error: {closed / 'a.png'}: cannot be written: ")
-
-
 def test_a_layer_that_cannot_be_written_is_reported_before_the_scene_is_read(unreadable: None) -> None:
     Path("a.normal.png").mkdir()
     refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")

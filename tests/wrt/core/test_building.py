@@ -1,18 +1,22 @@
-"""`wrt.build(progress=...)`: every structure reports the finished share of its build, from 0 to 1."""
+"""`wrt.build(progress=...)`: every structure reports the finished share of its build, from 0 to 1; and the seconds of a render's stages."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 
 import wrt
+from tests.data import ROOT
 from tests.refused import refused
 from wrt.accel.instances import Instances
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.building import build_clock, loading
 from wrt.scene.shapes import icosphere, torus
 
+SCENE = ROOT / "scenes" / "conductor.toml"
 RAYS = np.float32([[0, 0, 5], [0.3, 0.2, 5], [5, 5, 5]]), np.float32([[0, 0, -1]] * 3)
 
 
@@ -77,3 +81,22 @@ def test_after_an_error_in_the_function_later_builds_do_not_call_it(accel: str) 
     del kept
     wrt.build([icosphere(1), icosphere(2)], accel)
     assert calls == before
+
+
+@pytest.mark.parametrize("aov", [(), "depth"])
+def test_the_seconds_of_a_render_are_no_more_than_it_took(aov: str | tuple[str, ...]) -> None:
+    for _ in range(2):  # compiled, or from the cache of an earlier run; then kept by this process
+        begin = time.perf_counter()
+        film = wrt.render(SCENE, spp=1, size=(16, 9), aov=aov, tile_size=3)
+        whole = time.perf_counter() - begin
+        parts = film.stats["seconds"]
+        assert parts.keys() >= {"compile", "upload", "build", "trace"} and min(parts.values()) >= 0.0
+        assert max(parts.values()) <= whole and film.stats["accel"]["build_seconds"] <= parts["build"]
+        assert sum(parts[name] for name in parts if name != "compile") <= whole  # which runs beside upload and build
+
+
+def test_loading_of_kernels_does_not_count_as_building() -> None:
+    begin = build_clock()
+    with loading():
+        time.sleep(0.3)
+    assert 0.0 <= build_clock() - begin < 0.25

@@ -14,7 +14,7 @@ import pytest
 
 from tests.data import ROOT
 from tests.refused import refused
-from wrt.core.threads import run_all, run_growing, thread_count, verifying
+from wrt.core.threads import run_all, run_growing, thread_count
 
 
 def test_threads() -> None:
@@ -99,23 +99,6 @@ def test_threads_are_kept() -> None:
     assert 2 <= len(seen) < 150
 
 
-@pytest.mark.parametrize("start", [True, False])
-def test_tasks_run_without_the_main_thread(start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The standard pool takes no tasks then, and Python 3.12 starts no threads in atexit."""
-    ended = threading.Thread()
-    ended.start()
-    ended.join()
-    monkeypatch.setattr(threading, "main_thread", lambda: ended)
-    if not start:
-        def refuse(thread: threading.Thread) -> None:
-            raise RuntimeError("can't create new thread at interpreter shutdown")
-
-        monkeypatch.setattr(threading.Thread, "start", refuse)
-    done: list[int] = []
-    run_all([lambda: run_all([lambda: done.append(1)] * 5, 3)] * 20, 4)
-    assert len(done) == 100
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
     done: list[int] = []
@@ -135,15 +118,16 @@ def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
         run_growing(begin, [5], threads)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_check_that_fails_replaces_the_error_of_the_block(threads: int) -> None:
-    done = []
-    with verifying(lambda: done.append("check"), threads):
-        done.append("block")
-    assert sorted(done) == ["block", "check"]
-    for fails in (False, True):
-        with pytest.raises(ZeroDivisionError), verifying(lambda: 1 // 0, threads):
-            if fails:
-                raise KeyError
-    with pytest.raises(KeyError), verifying(lambda: None, threads):
-        raise KeyError
+SMALL_STACKS = """if True:
+    import threading, numpy as np, wrt
+    threading.stack_size(1 << 18)
+    accel, seen = wrt.build(wrt.Mesh(np.eye(3), [[0, 1, 2]])), []
+    thread = threading.Thread(target=lambda: seen.append(accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t[0]))
+    thread.start(), thread.join()
+    assert abs(seen[0] - 1 / 3) < 1e-6 and threading.stack_size(0) == 1 << 18
+"""
+
+
+def test_kernels_run_in_threads_with_small_stacks() -> None:
+    """On a stack of 256 KiB a kernel would end the process."""
+    subprocess.run([sys.executable, "-c", SMALL_STACKS], cwd=ROOT, check=True, timeout=120)

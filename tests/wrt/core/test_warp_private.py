@@ -20,7 +20,7 @@ from tests.data import ROOT
 from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
 
-from wrt.core import kernel_cache, warp_private
+from wrt.core import compiling, warp_private
 from wrt.core.device import preloading, start
 from wrt.core.errors import InputError
 from wrt.core.warp_private import WORKS_WITH
@@ -238,12 +238,12 @@ def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Pa
         Path(obj_path).write_text("object")
 
     def a_process(processor: bytes = b"a") -> None:
-        monkeypatch.setattr(kernel_cache, "_checked", set())
+        monkeypatch.setattr(compiling, "_checked", set())
         build = a_compiler(build_cpu, processor, monkeypatch)
         options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": None}
         with ThreadPoolExecutor(6) as pool:
             list(pool.map(lambda i: build.build_cpu(str(tmp_path / f"{i}.o"), str((without, with_it)[i % 2]), **options), range(6)))
-        assert all(kernel_cache.is_intact(tmp_path / f"{i}.o", True) for i in range(6))
+        assert all(compiling.is_intact(tmp_path / f"{i}.o", True) for i in range(6))
         build.build_cpu(str(tmp_path / "out.o"), str(with_it))  # without headers
 
     a_process()
@@ -292,9 +292,9 @@ def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tm
                 headers(others - 1)
             (folder / "made.pch").write_text("headers")
 
-        monkeypatch.setattr(kernel_cache, "_checked", set())
-        monkeypatch.setattr(kernel_cache, "_lock", threading.Lock())
-        given.append(kernel_cache.shared_headers("key", precompile, warp_private.LEFTOVER))
+        monkeypatch.setattr(compiling, "_checked", set())
+        monkeypatch.setattr(compiling, "_lock", threading.Lock())
+        given.append(compiling.shared_headers(Path(wp.config.kernel_cache_dir), "key", precompile, warp_private.LEFTOVER))
         inodes.append(given[-1].stat().st_ino)
 
     inodes: list[int] = []
@@ -311,7 +311,7 @@ def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tm
     inodes.clear()
     headers(2)
     assert len(inodes) == 3 and len({*inodes}) == 1 and {*given} == {folder}
-    assert list((tmp_path / "cache").iterdir()) == [folder] and kernel_cache._is_sealed(folder)
+    assert list((tmp_path / "cache").iterdir()) == [folder] and compiling._is_sealed(folder)
 
 
 @kernel

@@ -285,15 +285,6 @@ def test_unusable_outputs_are_refused(
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.png"]
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr("builtins.open", refuse)  # permissions do not bind the superuser, as which tests may run
-    with refused(None, "Permission denied", path="a.png"):
-        check_writable(tmp_path / "a.png")
-
-
 def test_a_write_protected_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.png").write_bytes(b"old")
     (tmp_path / "a.png").chmod(0o444)

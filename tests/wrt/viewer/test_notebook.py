@@ -20,7 +20,7 @@ import wrt
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
-from wrt.core.html import SHOWN_ROWS, Rows, html_table, number
+from wrt.core.tables import SHOWN_ROWS, Rows, html_table, number
 from wrt.renderer.options import Progress
 from wrt.scene.shapes import box
 from wrt.viewer.notebook import LiveView

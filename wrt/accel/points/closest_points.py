@@ -23,7 +23,6 @@ from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
 from wrt.core.device import upload
 from wrt.core.errors import InputError
-from wrt.core.suggestions import Suggests
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, KernelModule, WarpStruct
 from wrt.kernels.warp_private import fields_of
@@ -37,7 +36,7 @@ SIGNS = ("crossings", "winding")
 
 
 @dataclass(frozen=True, eq=False)
-class ClosestPoints(HitIds[np.ndarray], Suggests):
+class ClosestPoints(HitIds[np.ndarray]):
     """Closest points on a mesh. For a mesh without faces, `distance` is inf, `prim_id` -1, and the rest 0.
 
     Attributes

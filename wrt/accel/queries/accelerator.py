@@ -24,11 +24,9 @@ from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.core.arrays import to_tensor_like
-from wrt.core.checks import shown
+from wrt.core.checks import check_keywords, parameters_of, shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.core.other_names import same_name
-from wrt.core.suggestions import check_keywords, no_attribute, parameters_of
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape, refuse_capture
@@ -96,14 +94,13 @@ class Accelerator:
     if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
-            ours = same_name(name, (*FUNCTIONS, "move")) or name
             if name in ("to", "cuda"):
                 raise AttributeError(f"{type(self).__name__} stays on its device: build it with wrt.build(..., device=...)")
-            if ours in FUNCTIONS:
-                raise AttributeError(f"{ours} is a function: wrt.{ours}(accel, ...)")
-            if ours == "move" and not hasattr(type(self), "move"):
+            if name in FUNCTIONS:
+                raise AttributeError(f"{name} is a function: wrt.{name}(accel, ...)")
+            if name == "move" and not hasattr(type(self), "move"):
                 raise AttributeError(f"{type(self).__name__} cannot move: build it with wrt.build(..., movable=True)")
-            raise no_attribute(self, name, dir(type(self)))
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     def __copy__(self) -> Self:
         """Return a copy that shares all arrays. A refit of either does not change the other."""

@@ -17,10 +17,7 @@ from wrt.core.arrays import check_no_gradients, from_tensor, is_tensor, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
-from wrt.core.other_names import same_name
-from wrt.core.suggestions import Suggests, no_attribute
-from wrt.core.tables import write_table
+from wrt.core.tables import html_table, write_table
 from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
@@ -49,7 +46,7 @@ class Counters:
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name.startswith("_") or name not in (self.counts.dtype.names or ()):
-            raise no_attribute(self, name, self.__dict__.get("counts", np.empty(0)).dtype.names or ())
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
         return self.counts[name]
 
     def of(self, rays: np.ndarray) -> Counters:
@@ -72,7 +69,7 @@ class Counters:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits(HitPoints[ArrayT], Suggests):
+class Hits(HitPoints[ArrayT]):
     """Hits of rays, in arrays of the rays' shape (...). The arrays are NumPy's, or those of the rays' library: Warp, PyTorch or JAX.
 
     `hits[mask]`, `hits[10:20]` and `hits[i, j]` are the hits of some rays, in copied arrays, as NumPy indexes `t`.
@@ -108,7 +105,7 @@ class Hits(HitPoints[ArrayT], Suggests):
     def __getitem__(self, index: object) -> Hits[ArrayT]:
         """Return the hits of some rays. index: mask, slice, integers, or a tuple of these. Raises InputError under a recording tape."""
         if isinstance(index, str):
-            raise TypeError(f"hits[...] selects rays; write hits.{same_name(index, dir(self)) or index} in place of hits[{index!r}]")
+            raise TypeError(f"hits[...] selects rays; write hits.{index} in place of hits[{index!r}]")
         check_no_gradients("hits[...]", t=self.t)
         keys = tuple(to_numpy(key) if is_tensor(key) or isinstance(key, wp.array) else key
                      for key in (index if isinstance(index, tuple) else (index,)))

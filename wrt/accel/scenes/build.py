@@ -27,9 +27,9 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import from_tensor, is_tensor, to_numpy
 from wrt.core.building import reported_to
 from wrt.core.checks import as_one, shown
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.files import require_file
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh

@@ -15,8 +15,8 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
+from wrt.core.files import check_writable, write_bytes
 from wrt.core.packages import needed_by
-from wrt.core.write_file import check_writable, write_bytes
 from wrt.picture.image import write_image
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS, CameraKind

@@ -17,7 +17,7 @@ import numpy as np
 
 import wrt
 from wrt.core.device import describe_devices
-from wrt.core.html import Rows, html_table
+from wrt.core.tables import Rows, html_table
 from wrt.core.types import JsonObject
 from wrt.lab.plans import Plan
 

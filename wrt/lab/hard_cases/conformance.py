@@ -11,7 +11,7 @@ import numpy as np
 from wrt.accel.queries.answers import Hits
 from wrt.core.checks import as_integer, as_tuple
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
+from wrt.core.tables import html_table
 from wrt.lab.bench.report import Columns, Row, cells, table
 from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chunks, fewer, generate, judge
 

@@ -11,10 +11,10 @@ from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import BuildOptions, build
-from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
+from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.types import ArrayLike
 from wrt.lab.bench.rays import RaySet
 

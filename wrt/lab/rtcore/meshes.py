@@ -13,7 +13,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
-from wrt.core.write_file import check_writable
+from wrt.core.files import check_writable
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, mesh_name, tabled

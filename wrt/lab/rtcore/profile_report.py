@@ -8,8 +8,8 @@ import numpy as np
 
 from wrt.accel.queries.answers import Counters
 from wrt.core.errors import InputError
-from wrt.core.html import Rows
-from wrt.core.write_file import check_writable, write_bytes
+from wrt.core.files import check_writable, write_bytes
+from wrt.core.tables import Rows
 from wrt.lab.bench.plot import histograms, new_figure
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt

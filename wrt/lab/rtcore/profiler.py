@@ -14,9 +14,8 @@ import warp as wp
 
 from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
-from wrt.core.html import html_table
 from wrt.core.packages import needed_by
-from wrt.core.tables import write_table
+from wrt.core.tables import html_table, write_table
 from wrt.core.types import PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.shade.paths import BRANCHES, COATED, REFLECTED

@@ -16,10 +16,9 @@ from wrt.accel.queries.rays import Rays, rays_of
 from wrt.accel.queries.recorded_steps import RAYS_AT_ONCE, RecordedSteps, record_steps
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
-from wrt.core.files import require_file
+from wrt.core.files import require_file, write_bytes
 from wrt.core.tables import TABLES, write_table
 from wrt.core.types import ArrayLike, PathLike
-from wrt.core.write_file import write_bytes
 from wrt.kernels.traverse import steps as of
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import Prefetches

@@ -11,9 +11,9 @@ import numpy as np
 
 from wrt.core.checks import as_integer, as_path
 from wrt.core.errors import InputError
+from wrt.core.files import check_writable, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
-from wrt.core.write_file import check_writable, replacing
 from wrt.lab.walk.record import WalkRecord
 from wrt.lab.walk.regions import Region
 from wrt.renderer.inspector.section import Plane, cut

@@ -13,8 +13,8 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.recorded_steps import record_steps
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
+from wrt.core.files import write_bytes
 from wrt.core.types import ArrayLike, PathLike
-from wrt.core.write_file import write_bytes
 from wrt.lab.walk.drawing import draw, write_frames
 from wrt.lab.walk.record import WalkRecord
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from wrt.core.checks import as_choice, as_path
 from wrt.core.errors import InputError
+from wrt.core.files import write_bytes
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
-from wrt.core.write_file import write_bytes
 from wrt.renderer.inspector.marks import draw_outline, draw_stroke, label_points, label_shapes
 from wrt.renderer.inspector.section import frame, outlines, plane_of
 from wrt.renderer.inspector.side_view import draw_picture
