@@ -10,12 +10,13 @@ import stat
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 from zlib import crc32
 
-import numpy as np
-
 from wrt.core.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 BAD_NAMES = OSError, ValueError  # of names that the system does not have, and of names that no system takes
 
@@ -45,8 +46,10 @@ def utf8(text: bytes) -> bytes:
     return text.removeprefix(codecs.BOM_UTF8)
 
 
-def checksum_of(*arrays: np.ndarray) -> int:
+def checksum_of(*arrays: "np.ndarray") -> int:
     """Return the CRC-32 of arrays: of their shapes, types and bytes."""
+    import numpy as np  # not at the top, because it would delay the help of commands
+
     checksum = 0
     for array in arrays:
         head = f"{array.shape}{array.dtype.str}".encode()
