@@ -9,11 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from wrt.core.device import load_kernel
-from wrt.renderer import waves
-from wrt.renderer.film_arrays import OF_AOVS, AovFilm, DeviceFilm
+from wrt.renderer import launches as waves
+from wrt.renderer.film import OF_AOVS, AovFilm, DeviceFilm, Rectangle, Work
 from wrt.renderer.plan import aov_kernel, render_kernel
 from wrt.renderer.prepare import Prepared
-from wrt.renderer.tiles import Rectangle, Work
 
 
 def one_ray_at_a_time(ready: Prepared) -> Prepared:

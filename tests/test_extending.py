@@ -60,15 +60,14 @@ slope = np.tan(np.radians(20.0)) * (1.0 - (2.0 * np.arange(32) + 1.0) / 32.0)
 assert np.allclose(sign, 0.5 * 0.5 * (1.0 - slope / np.sqrt(1.0 + slope**2)), atol=1e-3)
 
 # A user's light and background: a beam of radius 0.5 on a floor of albedo 0.5. Beside the floor is the ground; the sky lights both.
-import beam, horizon
-from wrt.scene.pack import pack, unpack
+import beam, horizon, pickle
 
 stage = wrt.load_scene("stage.toml")
 assert isinstance(stage.lights[0], beam.BeamLight) and stage.lights[0].radius == 0.5
 moved = stage.lights[0].moved(np.diag([2.0, 2.0, 2.0, 1.0]))
 assert moved.position == (0.0, 6.0, 0.0) and moved.direction == (0.0, -1.0, 0.0)
 picture = wrt.render(stage, threads=2).pixels[:, :, 1]
-assert np.array_equal(wrt.render(unpack(*pack(stage)), threads=2).pixels[:, :, 1], picture)
+assert np.array_equal(wrt.render(pickle.loads(pickle.dumps(stage)), threads=2).pixels[:, :, 1], picture)
 x = 5.0 * np.tan(np.radians(20.0)) * ((2.0 * np.arange(32) + 1.0) / 32.0 - 1.0)
 distance, side = np.hypot(x[:, None], x), np.maximum(np.abs(x[:, None]), np.abs(x))
 for where, expected in ((distance < 0.4, 0.5 + 0.125), ((distance > 0.6) & (side < 1.1), 0.125), (side > 1.3, 1.0)):
@@ -139,11 +138,11 @@ import itertools
 from dataclasses import replace
 import numpy as np, wrt
 from wrt.core.device import load_kernel, start
-from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.film import DeviceFilm
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of, render_kernel
 from wrt.renderer.prepare import prepare
-from wrt.renderer.tiles import Work
+from wrt.renderer.film import Work
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Checkerboard, Material, Texture
@@ -196,11 +195,11 @@ assert np.allclose(directions, expected, atol=1e-6)
 assert np.allclose(film.aov["depth"], 3.0, rtol=1e-6)  # from the middle of a sphere
 assert np.allclose(film.pixels[..., 0], 0.25, atol=1e-5)
 
+import pickle
 from wrt.io.toml.reference_page import scene_format
 from wrt.scene.digest import digest
-from wrt.scene.pack import pack, unpack
 
-(back,) = unpack(*pack(scene)).cameras
+(back,) = pickle.loads(pickle.dumps(scene)).cameras
 assert digest(back) == digest(camera)
 assert "### Cylinder camera" in scene_format()
 print("all of it works")

@@ -1,6 +1,6 @@
 """The state of a wave: arrays with one entry for each pixel, sample, place in a queue, or hit. A place is an index in a queue.
 
-The host writes Task and Pixels.order; kernels write the other arrays. wrt/renderer/waves.py allocates the arrays for up to `capacity`
+The host writes Task and Pixels.order; kernels write the other arrays. wrt/renderer/launches.py allocates the arrays for up to `capacity`
 samples. Sample s belongs to pixel s / task.samples of the wave, rounded down."""
 
 import warp as wp

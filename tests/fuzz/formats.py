@@ -323,11 +323,11 @@ IDENTITY = {"seed": 0, "crop": [0, 0, 6, 4], "scene": "x", "kernels": "y"}
 def checkpoint_of(path: Path, groups: int) -> tuple[Any, Any]:
     from wrt.core.device import start
     from wrt.renderer.checkpoint import Checkpoint
-    from wrt.renderer.film_arrays import DeviceFilm
+    from wrt.renderer.film import DeviceFilm
     from wrt.scene.settings import Settings
 
     film = DeviceFilm(Settings(size=(6, 4)), (0, 0, 6, 4), start("cpu"), 0, groups)
-    return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, groups=groups, resume=True)
+    return film, Checkpoint(path, 60.0, {**IDENTITY, "groups": groups}, resume=True)
 
 
 @cache

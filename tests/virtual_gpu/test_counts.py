@@ -15,9 +15,9 @@ from tests import device
 from tests.data import ROOT
 from tests.virtual_gpu import gpus
 from wrt.accel.queries import batches
-from wrt.renderer import pixels
+from wrt.renderer import launches as pixels
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene import shapes
 
 pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")

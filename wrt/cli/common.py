@@ -232,7 +232,7 @@ def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = N
 
 def depth_hint(stats: dict[str, Any], max_depth: int, option: str = "--max-depth ") -> str | None:
     """Return advice on max_depth, or None if few pixels are visibly too dark. stats: Film.stats."""
-    from wrt.renderer.film_arrays import FEW
+    from wrt.renderer.film import FEW
     from wrt.scene.settings import MAX_DEPTH
 
     if stats["visibly_cut"] < FEW:
@@ -257,7 +257,7 @@ def client_of(cluster: str | None) -> "Client | None":
     """Return a Dask client of the scheduler at address `cluster`, connected until the command ends; None if `cluster` is None."""
     if cluster is None:
         return None
-    from wrt.renderer.distributed.dask import connected
+    from wrt.renderer.cluster import connected
 
     return click.get_current_context().with_resource(connected(cluster))
 

@@ -14,7 +14,7 @@ from wrt.cli.common import load, naming, say, say_json, shared, warnings_reporte
 @shared("accel", "device", "threads", "quiet", "as_json")
 def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: int | None, quiet: bool, as_json: bool) -> None:
     from wrt.core.threads import thread_count
-    from wrt.renderer.compile import compile_picture, compile_queries
+    from wrt.renderer.prepare import compile_picture, compile_queries
 
     count, done = thread_count(threads), list[dict[str, object]]()
 

@@ -203,7 +203,7 @@ def trace(loaded: "Scene", path: Path, spp: int | None, options: dict[str, Parse
     """Render a scene, with progress on stderr. path: the scene's file. Raises Interrupted if interrupted before the first sample."""
     from wrt.renderer.progress import progress_reporter
     from wrt.renderer.render import render as render_scene
-    from wrt.renderer.result import plain_text
+    from wrt.renderer.schedule import plain_text
 
     with progress_reporter(quiet) as progress, naming(path):
         film = render_scene(loaded, spp=spp, progress=progress, **options)

@@ -16,10 +16,9 @@ from wrt.core.types import Device, WarpArray, WarpType
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.kernels.warp_private import fields_of
-from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.film import DeviceFilm, Rectangle, Work
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared, prepare
-from wrt.renderer.tiles import Rectangle, Work
 from wrt.scene.cameras import CameraKind
 
 T = TypeVar("T")

@@ -35,9 +35,9 @@ from wrt.lab.bench.timing import alternate_on, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.cases import HARD_CASES, generate
 from wrt.lab.hard_cases.contestants import CONSTRUCTORS, Own, WarpMesh
-from wrt.renderer.compile import compile_queries
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
+from wrt.renderer.prepare import compile_queries
 from wrt.renderer.render import render
 from wrt.scene import shapes
 from wrt.scene.backgrounds import GradientBackground

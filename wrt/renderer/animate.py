@@ -14,7 +14,7 @@ from wrt.core.files import check_writable, replacing
 from wrt.core.packages import needed_by
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.defaults import frame_turn
 from wrt.scene.model import Scene, moves, scene_at

@@ -1,9 +1,6 @@
 """The Features (kernels/shade/features.py) with which the render kernels of a scene are compiled."""
 
 import math
-from functools import cache
-
-import numpy as np
 
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.core.types import JsonObject
@@ -86,24 +83,6 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
         refraction=refraction,
         stack_size=1 if children < 2 else STACK_STEP * math.ceil(pending / STACK_STEP),
     )
-
-
-@cache
-def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
-    """Return the inverse cumulative distribution of a pixel filter along x or y, (size,) float32, in pixels from the centre.
-
-    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: the four-term window, 3 pixels wide (Harris 1978). Kernels
-    interpolate linearly, which widens the tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3."""
-    x = np.linspace(-1.5, 1.5, 20001)
-    if name == "gaussian":
-        density = np.exp(-2.0 * x * x) - np.exp(-2.0 * 1.5 * 1.5)
-    elif name == "blackman-harris":
-        phase = 2.0 * np.pi * (x / 3.0 + 0.5)
-        density = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
-    else:
-        return np.zeros(2, np.float32)
-    cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)
 
 
 def describe(scene: Scene, camera: str | int | None = None) -> JsonObject:

@@ -19,9 +19,9 @@ from wrt.kernels.loops import one_ray as kernels
 from wrt.kernels.shade.features import Features
 from wrt.kernels.traverse.common import Units
 from wrt.renderer.features import features_of
-from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS
+from wrt.renderer.film import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROUPS
+from wrt.renderer.launches import WaveKernels, wave_kernels
 from wrt.renderer.options import Options
-from wrt.renderer.waves import WaveKernels, wave_kernels
 from wrt.scene.cameras import CameraKind
 from wrt.scene.far import moved_by, moved_camera, scene_origin
 from wrt.scene.model import Scene
@@ -64,7 +64,7 @@ class Plan:
 
     @property
     def groups(self) -> int:
-        """Number of groups of samples, each an independent sequence (wrt.renderer.film_arrays)."""
+        """Number of groups of samples, each an independent sequence (wrt.renderer.film)."""
         return 1 if self.options.target_error is None else GROUPS
 
     @property

@@ -14,18 +14,20 @@ import numpy as np
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.core.compiling import WATCH
-from wrt.core.device import load_kernel
-from wrt.core.threads import FreeList, Pool, thread_count
+from wrt.core.device import load_kernel, start
+from wrt.core.settings import DEFAULT_DEVICE
+from wrt.core.threads import FreeList, Pool, run_all, thread_count
 from wrt.core.types import Device, Kernel, WarpStruct
-from wrt.renderer.film_arrays import AovFilm, DeviceFilm
-from wrt.renderer.options import Progress
-from wrt.renderer.pixels import aov_launch, film_launch
-from wrt.renderer.plan import Plan
-from wrt.renderer.tiles import Rectangle, Work, corners, tiles
+from wrt.core.warp_private import short_name
+from wrt.renderer.film import OF_AOVS, AovFilm, DeviceFilm, Rectangle, Work, corners, tiles
+from wrt.renderer.launches import CAPACITY, Buffers, SceneRecords, Waves, aov_launch, film_launch
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
-from wrt.renderer.waves import CAPACITY, Buffers, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
+from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges
+from wrt.scene.shapes import icosphere
 
 TILE_SIZE = 32  # Smallest side of a tile on the CPU, in pixels.
 TILES_EACH = 8  # Tiles of a pass for each thread, or more.
@@ -92,7 +94,7 @@ class Prepared:
         by_pixels = self.device.is_cpu or self.plan.structure.units.counters
         return film_launch(self.device, self.kernels[0], scene, limits, film, by_pixels)
 
-    # --- called by workers (wrt.renderer.distributed) ---
+    # --- called by workers (wrt.renderer.workers) ---
 
     def ready(self) -> dict[str, object]:
         return {"facts": self.facts(), "seconds": self.seconds}
@@ -183,3 +185,23 @@ class _Preparation:
                            progress=partial(setattr, self, "fraction_built"), **chosen)
         self.fraction_built = 0.0  # what takes long from now on is compiling
         self.seconds |= {"upload": uploaded - begin, "build": time.perf_counter() - uploaded}
+
+
+# --- ahead of time, for containers and the workers of a cluster -----------------------------------------------------------
+
+
+def compile_queries(accel: str, device: str = DEFAULT_DEVICE) -> list[str]:
+    """Compile the kernels that build and query an acceleration structure; return their names. Raises InputError for an unknown name."""
+    structure = build(icosphere(2), accel, device)
+    rays = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32)
+    structure.closest_hit(*rays)
+    structure.any_hit(*rays)
+    return ["closest_hit", "any_hit"]
+
+
+def compile_picture(scene: Scene, accel: str, device: str = DEFAULT_DEVICE, threads: int = 1) -> list[str]:
+    """Compile the kernels that render a scene with all AOVs; return their names. Raises InputError if the scene cannot be rendered."""
+    target = start(device)
+    kernels = plan_of(scene, Options(accel=accel, device=device, aov=tuple(OF_AOVS))).kernels
+    run_all([partial(load_kernel, kernel, target) for kernel in kernels], threads)
+    return [short_name(kernel) for kernel in kernels]

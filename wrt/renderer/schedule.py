@@ -1,4 +1,4 @@
-"""Schedule of a render: passes of tiles, until the samples, the time limit, the target error or Ctrl-C end it."""
+"""The render of a picture: passes over its tiles, until the number of samples, a time limit, a target error or Ctrl-C ends it."""
 
 import math
 import time
@@ -7,43 +7,39 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
-from functools import partial
-from typing import Protocol
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import warp as wp
 
-from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
-from wrt.core.threads import submit, with_stack
+from wrt.core.threads import submit
 from wrt.core.types import Device
+from wrt.core.version import VERSION
 from wrt.picture.film import Film
-from wrt.renderer.checkpoint import Checkpoint
-from wrt.renderer.film_arrays import AovFilm, DeviceFilm
+from wrt.picture.tonemap import auto_exposure
+from wrt.renderer.film import VISIBLE, AovFilm, DeviceFilm, Rectangle, Work, needed_depth
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared
-from wrt.renderer.result import Facts, bare_film, film_of
-from wrt.renderer.tiles import Rectangle, Work, work_left
+
+if TYPE_CHECKING:
+    from wrt.renderer.checkpoint import Checkpoint
 
 MAX_PASS = 64  # Largest number of samples per pixel in a pass. On a GPU, Ctrl-C waits for the end of the pass.
 # Factor by which the samples per pixel grow from pass to pass. A larger factor is faster on the CPU (with 16 spp, 4 is up to 1.15 times
 # as fast as 2). If the render ends early, however, the samples are spread less evenly over the picture.
 GROWTH = 4
 STEP_SECONDS = 0.1  # Time between two steps of a tracer.
-OVERTIME = 5.0  # Seconds after the time limit without a finished tile, until the pass is abandoned. In the first pass: SILENT.
-SILENT = 20.0  # Seconds without a finished tile until the progress notes it.
 
 # A step: samples done, summed over pixels; and True if no tile is running, so that all pixels have whole samples.
 Steps = Generator[tuple[int, bool], None, None]
-
-
-class OutOfTime(Exception):
-    """The time limit has passed, and for some seconds the tracer has finished no tile."""
+Facts = dict[str, Any]  # entries of a film's stats
 
 
 class Tracer(Protocol):
-    """Traces the tiles of a run, with threads of this process or with workers (wrt.renderer.distributed).
+    """Traces the tiles of a run, with threads of this process or with workers (wrt.renderer.workers).
 
     - device: the film's device. seconds: time by stage of the preparation. facts: entries of Film.stats. tiles: tiles of a pass.
     - trace: yields an item of Steps about every tenth of a second, and one at the end. If `due()` is true, it first waits for the
@@ -74,9 +70,6 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        if min(self.prepared.threads, len(work)) == 1:  # the calling thread
-            yield from self._trace_here(trace, work, due)
-            return
         left, samples = deque(work), list[int]()  # a future for each job would add 10 % to a short picture
         at_rest = False
 
@@ -105,15 +98,6 @@ class LocalTracer:
             left.clear()
             wait(running)
 
-    def _trace_here(self, trace: Callable[[Work], int], work: list[Work], due: Callable[[], bool]) -> Steps:
-        done, next_step = 0, time.monotonic() + STEP_SECONDS
-        for job in work:
-            done += with_stack(partial(trace, job))
-            if time.monotonic() >= next_step or due():
-                yield done, True
-                next_step = time.monotonic() + STEP_SECONDS
-        yield done, True
-
 
 class Passes:
     """Iterator over passes: index of the first sample, and number of samples, of each pixel in each group.
@@ -128,13 +112,12 @@ class Passes:
         self.spp = max(1, spp // len(film.groups))
         self.largest = MAX_PASS // len(film.groups)
         self.fewest, self.most = samples
-        self.expected_spp, self.timed_out, self.deadline = self.spp, False, math.inf
+        self.expected_spp, self.timed_out = self.spp, False
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         limit = self.options.time_limit or math.inf
         first = timed_from = self.fewest  # the speed is measured from the sample `timed_from` on, which began at the time `since`
         begin = since = time.perf_counter()
-        self.deadline = begin + limit
         count = self._size(first)
         while first < self.spp and (first < self.most or not self._precise_enough(first)):
             count = min(count, (self.most if first < self.most else self.spp) - first)
@@ -142,7 +125,7 @@ class Passes:
                 count = min(count, (1 << first.bit_length()) - first)  # up to the next power of 2
             if first > 0 and min(limit, self.every) < math.inf:
                 now = time.perf_counter()
-                left = self.deadline - now
+                left = begin + limit - now
                 if left <= 0.0:
                     self.timed_out = True
                     return
@@ -170,10 +153,33 @@ class Passes:
         return error <= target
 
 
+def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
+    """Return the part of the work that is not done yet. samples: samples that each pixel of the crop has, (H, W) int32.
+
+    Rectangles are halved until all pixels of a part have equally many samples. This ends soon: the earlier run finished whole tiles."""
+    out = []
+    stack = work[::-1]
+    while stack:
+        (x, y, width, height), first, n = stack.pop()
+        of_part = samples[y - crop[1] : y - crop[1] + height, x - crop[0] : x - crop[0] + width]
+        low, high = int(of_part.min()), int(of_part.max())
+        goal = first + n
+        if low == high:
+            if low < goal:
+                out.append(Work((x, y, width, height), low, goal - low))
+        elif low < goal:
+            if width >= height:
+                parts = [(x, y, width // 2, height), (x + width // 2, y, width - width // 2, height)]
+            else:
+                parts = [(x, y, width, height // 2), (x, y + height // 2, width, height - height // 2)]
+            stack += [Work(part, first, n) for part in parts[::-1]]
+    return out
+
+
 class Run:
     """The render of one picture. seed, spp: replace the options' seed and the scene's spp, unless None."""
 
-    def __init__(self, tracer: Tracer, checkpoint: Checkpoint | None, seed: int | None = None, spp: int | None = None) -> None:
+    def __init__(self, tracer: Tracer, checkpoint: "Checkpoint | None" = None, seed: int | None = None, spp: int | None = None) -> None:
         plan = tracer.plan
         self.tracer, self.plan, self.checkpoint = tracer, plan, checkpoint
         self.seed = plan.options.seed if seed is None else seed
@@ -181,21 +187,22 @@ class Run:
         self.aov: dict[str, np.ndarray] = {}
         self.seconds, self.seconds_before = dict(tracer.seconds), 0.0
         self.interrupts: list[int] = []
+        self.due: Callable[[], bool] = lambda: False
         samples, every = (0, 0), math.inf
-        if checkpoint is not None and checkpoint.saved is not None:
+        if checkpoint is not None:
             checkpoint.restore(self.arrays)
-            samples, self.seconds_before = checkpoint.saved.samples, checkpoint.saved.seconds
-        if checkpoint is not None and tracer.device.is_cuda:  # the film cannot be saved during a launch, which traces the whole picture
-            every = checkpoint.every
+            self.due = checkpoint.due
+            if checkpoint.saved is not None:
+                samples, self.seconds_before = checkpoint.saved.samples, checkpoint.saved.seconds
+            if tracer.device.is_cuda:  # the film cannot be saved during a launch, which traces the whole picture
+                every = checkpoint.every
         self.passes = Passes(self.arrays, plan.options, spp or plan.scene.settings.spp, samples, every)
 
     def film(self) -> Film:
         """Render and return the film."""
         begin = self.begin = time.perf_counter()
-        interrupted = out_of_time = False
+        interrupted = False
         with held_interrupts() as self.interrupts:
-            if self.checkpoint is not None:
-                self.checkpoint.begin()
             try:
                 if self.plan.options.aov:
                     self._trace_aovs()
@@ -205,39 +212,34 @@ class Run:
                     self._trace_pass(first, count)
             except KeyboardInterrupt:  # raised by _trace, or by a progress callback
                 interrupted = True
-            except OutOfTime:
-                out_of_time = True
-            except Exception as error:
-                self._save_before(error)
+            except Exception:
+                if self.tracer.device.is_cpu:  # after an error on CUDA, the film may be unreadable
+                    self._save(self._elapsed())
                 raise
             self.seconds["trace"] = self._elapsed()
-            if self.checkpoint is not None:
-                self.checkpoint.save(self.arrays, self.seconds["trace"])
-                if self.checkpoint.problem:
-                    warnings.warn(self.checkpoint.problem, RuntimeWarning, stacklevel=4)
-            facts = self._facts(interrupted or bool(self.interrupts), out_of_time)
+            self._save(self.seconds["trace"])
+            facts = self.tracer.facts() | self._end(interrupted or bool(self.interrupts))
             return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
 
-    def _facts(self, interrupted: bool, out_of_time: bool) -> Facts:
-        """Return the entries of Film.stats about the scene, the end of the run and the checkpoint."""
-        end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
-               "timed_out": (out_of_time or self.passes.timed_out) and not interrupted}
-        return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
+    def _end(self, interrupted: bool) -> Facts:
+        """Return the entries of Film.stats about the end of the run and the checkpoint."""
+        end: Facts = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
+                      "timed_out": self.passes.timed_out and not interrupted}
+        if self.checkpoint is not None:
+            if self.checkpoint.problem:
+                warnings.warn(self.checkpoint.problem, RuntimeWarning, stacklevel=5)
+            saved = self.checkpoint.saved
+            end["checkpoint"] = None if self.checkpoint.problem else str(self.checkpoint.path)
+            end["resumed"] = saved and {"samples": saved.samples[0] * self.plan.groups, "seconds": saved.seconds}
+        return end
 
-    def _save_before(self, error: Exception) -> None:
-        """Save a checkpoint before an error ends the run. After an error on CUDA, the film may be unreadable and is not saved."""
-        if self.checkpoint is None or self.tracer.device.is_cuda:
-            return
-        self.checkpoint.save(self.arrays, self._elapsed())
-        if isinstance(error, InputError) and not self.checkpoint.problem:
-            raise error.at(hint=f"{self.checkpoint.path} has the samples so far") from error
+    def _save(self, seconds: float) -> None:
+        if self.checkpoint is not None:
+            self.checkpoint.save(self.arrays, seconds)
 
     def _elapsed(self) -> float:
         """Return the seconds of tracing, including those before a resume."""
         return self.seconds_before + time.perf_counter() - self.begin
-
-    def _due(self) -> bool:
-        return self.checkpoint is not None and self.checkpoint.due()
 
     def _trace_pass(self, first: int, count: int) -> None:
         """Trace until every pixel has at least `first + count` samples in each group of samples.
@@ -246,43 +248,80 @@ class Run:
         if first < self.passes.most:  # after a resume
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
-        self._trace(self.arrays, work, lambda done, silent: self._report(before + done, silent), OVERTIME if first else SILENT)
+        self._trace(self.arrays, work, lambda done: self._report(before + done))
 
     def _trace_aovs(self) -> None:
         arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
-        work = [Work(tile, 0, 1) for tile in self.tracer.tiles(1)]
-        self._trace(arrays, work, lambda done, silent: None, SILENT)
+        self._trace(arrays, [Work(tile, 0, 1) for tile in self.tracer.tiles(1)], lambda done: None)
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
-    def _trace(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
-        """Trace, save checkpoints, and call report(samples done, seconds without a finished tile). Ctrl-C raises KeyboardInterrupt.
-
-        Raises OutOfTime if, after the time limit, no tile was finished for `overtime` seconds."""
+    def _trace(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int], None]) -> None:
+        """Trace, save checkpoints, and call report(samples done). Ctrl-C raises KeyboardInterrupt."""
         total = sum(job.total for job in work)
         if self.interrupts:
             raise KeyboardInterrupt
-        before, received = 0, time.perf_counter()
-        with closing(self.tracer.trace(film, work, self._due)) as steps:
+        with closing(self.tracer.trace(film, work, self.due)) as steps:
             for done, at_rest in steps:
-                now = time.perf_counter()
-                if done > before:
-                    before, received = done, now
-                if self.checkpoint is not None and at_rest and self.checkpoint.due():
-                    self.checkpoint.save(self.arrays, self._elapsed())
-                report(done, now - received)
+                if at_rest and self.due():
+                    self._save(self._elapsed())
+                report(done)
                 if done < total and self.interrupts:
                     raise KeyboardInterrupt
-                if done < total and now - max(received, self.passes.deadline) > overtime:
-                    raise OutOfTime
 
-    def _report(self, done: int, silent: float) -> None:
-        """Call Options.progress. done: samples of one group, summed over the pixels. silent: seconds without a finished tile."""
+    def _report(self, done: int) -> None:
+        """Call Options.progress. done: samples of one group, summed over the pixels."""
         plan = self.plan
-        if plan.options.progress is None:
-            return
-        total = plan.area * self.passes.expected_spp * plan.groups
-        note = "" if self.checkpoint is None else self.checkpoint.problem
-        if silent > SILENT and not note:
-            note = f"a worker has not answered for {silent:.0f} s"
-        plan.options.progress(Progress(done * plan.groups, total, self.arrays.count("rays"), self._elapsed(), note=note,
-                                       picture=lambda: bare_film(plan, self.arrays.snapshot())))
+        if plan.options.progress is not None:
+            total = plan.area * self.passes.expected_spp * plan.groups
+            note = "" if self.checkpoint is None else self.checkpoint.problem
+            plan.options.progress(Progress(done * plan.groups, total, self.arrays.count("rays"), self._elapsed(), note=note,
+                                           picture=lambda: bare_film(plan, self.arrays.snapshot())))
+
+
+# --- films ------------------------------------------------------------------------------------------------------------
+
+
+def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float], facts: Facts) -> Film:
+    """Return the film with its statistics. facts: entries of Film.stats about the scene, its structure and the end of the run."""
+    arrays = arrays.snapshot()
+    options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
+    total = max(int(samples.sum()), 1)
+    rays = arrays.count("rays")
+    ior = max((m.ior for m in plan.scene.materials if m.kind == "glass" or m.transmission > 0.0), default=1.0)
+    most_by_throughput = settings.min_throughput * ior**2  # inside glass, radiance is larger by ior^2
+    lost = arrays.lost_by_depth(most_by_throughput) if plan.features.reflection else np.zeros(samples.shape)
+    stats: dict[str, Any] = {
+        "seconds": seconds, "rays": rays, "rays_per_sample": rays / total,
+        "rays_per_second": rays / seconds["trace"] if seconds["trace"] > 0.0 else 0.0,
+        "cut_by_depth": arrays.count("cut_depth"), "cut_by_throughput": arrays.count("cut_throughput"),
+        "lost_throughput_per_sample": arrays.lost_throughput() / total,
+        "visibly_cut": float((lost > VISIBLE).mean()), "lost_by_depth": float(lost.mean()),
+        "needed_depth": needed_depth(lost, settings.max_depth),
+        "clamped_share": arrays.clamped_share() if settings.clamp else 0.0,
+        "not_finite": arrays.count("not_finite"), "samples": int(samples.sum()), **facts,
+    }
+    if options.target_error is not None:
+        error = arrays.error()
+        stats |= {"estimated_error": error, "target_error": options.target_error,
+                  "target_reached": error <= options.target_error and int(samples.min()) > 0}
+    metadata = {
+        "scene": plain_text(plan.scene.name), "camera": plain_text(plan.camera.name), "spp": int(samples.max()), "seed": seed,
+        "seconds": round(seconds["trace"], 3), "version": VERSION, "max_depth": settings.max_depth, "filter": settings.filter,
+        "accel": options.accel, "device": ",".join(options.devices or [options.device]),
+    }
+    if settings.clamp:
+        metadata |= {"clamp": settings.clamp, "clamped_share": stats["clamped_share"]}
+    return replace(bare_film(plan, arrays), aov=aov, stats=stats, metadata=metadata)
+
+
+def bare_film(plan: Plan, arrays: DeviceFilm) -> Film:
+    """Return a film with pixels, variance and samples only. arrays: result of DeviceFilm.snapshot."""
+    settings = plan.scene.settings
+    pixels, variance = arrays.pixels_and_variance()
+    exposure = settings.exposure + (auto_exposure(pixels) if settings.auto_exposure else 0.0)
+    return Film(pixels, variance, arrays.samples(), exposure=exposure, tonemap=settings.tonemap)
+
+
+def plain_text(name: str) -> str:
+    """Return a name that UTF-8 can encode: lone surrogates, which glTF files and file names may contain, become "?"."""
+    return name.encode("utf-8", "replace").decode()

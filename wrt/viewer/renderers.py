@@ -11,7 +11,7 @@ import numpy as np
 from wrt.picture.film import Film
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import digest
 from wrt.scene.model import Scene

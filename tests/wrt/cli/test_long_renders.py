@@ -21,7 +21,7 @@ from tests.device import NAME
 from wrt.core.errors import InputError
 from wrt.picture import film
 from wrt.picture.image import read_channels
-from wrt.renderer.checkpoint import Checkpoint, read
+from wrt.renderer.checkpoint import read
 
 SMALL = ("--size", "32x18", "--spp", 4)
 
@@ -215,7 +215,7 @@ def test_a_render_beside_a_checkpoint_says_that_it_begins_anew() -> None:
     (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
 ])
 def test_wrong_checkpoint_options_are_refused_early(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
+    monkeypatch.setattr("wrt.renderer.render.prepare", lambda *_: pytest.fail("the work began"))
     result = run("render", "box.obj", *SMALL, "-o", "a.png", *arguments)
     assert result.code == 2 and message in result.err and result.out == "" and new_files() == set()
     assert "error: box.obj: /" not in result.err  # the error does not name the scene
@@ -247,42 +247,3 @@ def test_a_picture_that_cannot_be_written_goes_to_another_folder() -> None:
     assert result.errors == [error]
     assert {"R", "depth.Z"} <= read_channels(str(place)).keys() and place.parent.stat().st_mode & 0o077 == 0
     assert new_files() == {"a.exr.checkpoint"} and read("a.exr.checkpoint").samples == (4, 4)  # it can still be resumed
-
-
-@pytest.mark.parametrize("place", ["nowhere", "tmp"])
-def test_if_both_folders_fail_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: film.Film, path: Any, **options: Any) -> list[Path]:
-        raise InputError("cannot be written: No space left on device", path=path)
-
-    monkeypatch.setattr(film.Film, "save", full)
-    monkeypatch.setattr("tempfile.tempdir", str(Path(place).absolute()))
-    result = run("render", "box.obj", *SMALL)
-    assert result.code == 2 and result.out == "" and result.errors == ["error: box.png: cannot be written: No space left on device"]
-    assert new_files() == set() and not list(Path("tmp").iterdir())
-
-
-def test_a_folder_at_the_checkpoints_path_prevents_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    save = Checkpoint.save
-
-    def taken(self: Checkpoint, *arguments: Any) -> None:
-        self.path.unlink(missing_ok=True)
-        self.path.mkdir(exist_ok=True)
-        save(self, *arguments)
-
-    monkeypatch.setattr(Checkpoint, "save", taken)
-    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--checkpoint", "60s")
-    assert (result.code, result.out) == (0, "a.png\n") and new_files() == {"a.png", "a.png.checkpoint"}
-    assert result.err.count("a.png.checkpoint: is a folder") == 1 and "--resume" not in result.err
-    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--resume")
-    assert result.code == 2 and result.errors == ["error: a.png.checkpoint: is a folder"]
-
-
-def test_a_checkpoint_that_cannot_be_removed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(path: Path, missing_ok: bool = False) -> None:
-        raise PermissionError(1, "Operation not permitted", str(path))
-
-    monkeypatch.setattr(Path, "unlink", refused)
-    result = run("render", "box.obj", *SMALL, "-o", "a.png", "--checkpoint", "60s")
-    assert result.code == 2 and new_files() == {"a.png", "a.png.checkpoint"}
-    (error,) = result.errors
-    assert error.startswith("error: a.png.checkpoint: cannot be removed: Operation not permitted; ")

@@ -31,7 +31,7 @@ from wrt.picture.image import read_channels, read_image, write_image
 from wrt.renderer import progress as progress_module
 from wrt.renderer.features import features_of, switches
 from wrt.renderer.options import Progress
-from wrt.renderer.result import film_of
+from wrt.renderer.schedule import film_of
 
 SMALL = ("--size", "32x18", "--spp", 2)
 TWO_CAMERAS = """\
@@ -290,7 +290,7 @@ def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*arguments: Any) -> None:
         raise MemoryError("Unable to allocate 9 GiB")
 
-    monkeypatch.setattr("wrt.renderer.renderer.prepare", fail)
+    monkeypatch.setattr("wrt.renderer.render.prepare", fail)
     refused(run("render", "box.obj"), "not enough memory: Unable to allocate 9 GiB")
 
 

@@ -23,7 +23,7 @@ from tests.data import ROOT
 from wrt.cli.common import ACCEL, depth_hint
 from wrt.cli.main import cli
 from wrt.picture.image import read_image
-from wrt.renderer.film_arrays import FEW, GROUPS, VISIBLE
+from wrt.renderer.film import FEW, GROUPS, VISIBLE
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material

@@ -12,8 +12,8 @@ from tests.refused import refused
 from wrt.core import device
 from wrt.io.load import load_scene
 from wrt.renderer import prepare
-from wrt.renderer.compile import compile_picture, compile_queries
-from wrt.renderer.film_arrays import OF_AOVS
+from wrt.renderer.film import OF_AOVS
+from wrt.renderer.prepare import compile_picture, compile_queries
 from wrt.renderer.render import render
 
 

@@ -25,10 +25,8 @@ from wrt.picture.film import Film
 from wrt.renderer import prepare, schedule
 from wrt.renderer.options import AOVS, Options, Progress, RenderOptions
 from wrt.renderer.plan import plan_of
-from wrt.renderer.render import render
-from wrt.renderer.renderer import Renderer, builder_for
-from wrt.renderer.result import plain_text
-from wrt.renderer.schedule import MAX_PASS, Run
+from wrt.renderer.render import Renderer, builder_for, render
+from wrt.renderer.schedule import MAX_PASS, Run, plain_text
 from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
@@ -544,7 +542,7 @@ def test_slow_building_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.renderer.plan.memory_of", lambda device: 2.0**30)
-    monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("work was done"))
+    monkeypatch.setattr("wrt.renderer.render.prepare", lambda *_: pytest.fail("work was done"))
     with refused(what="4096x4096 takes 2.1 GiB"):
         render(SCENE, size=(4096, 4096))
 

@@ -15,10 +15,9 @@ from tests.data import ROOT
 from tests.refused import refused
 from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
-from wrt.renderer.film_arrays import GROUPS
+from wrt.renderer.film import GROUPS
 from wrt.renderer.options import Options
-from wrt.renderer.render import MAX_SPP, render
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import MAX_SPP, Renderer, render
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere

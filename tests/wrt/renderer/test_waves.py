@@ -18,12 +18,11 @@ from tests.data import ROOT
 from wrt.core.device import start
 from wrt.io.load import load_scene
 from wrt.kernels.loops import wave
-from wrt.renderer import waves
-from wrt.renderer.film_arrays import OF_AOVS
+from wrt.renderer import launches as waves
+from wrt.renderer.film import OF_AOVS, corners
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, prepare
-from wrt.renderer.tiles import corners
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight

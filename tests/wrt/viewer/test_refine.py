@@ -20,7 +20,7 @@ from wrt.lab.costs import CostCounter
 from wrt.lab.rtcore.profiler import profile
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera, FisheyeCamera
 from wrt.scene.lights import DirectionalLight

@@ -29,7 +29,7 @@ from wrt.picture import metrics
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.progress import TimeLeft
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene.model import Scene
 from wrt.scene.settings import SAMPLERS
 

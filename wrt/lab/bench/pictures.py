@@ -14,11 +14,10 @@ from wrt.io.load import load_scene
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.plans import Pictures as Plan
-from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of, render_kernel
 from wrt.renderer.prepare import Prepared, prepare
-from wrt.renderer.tiles import Work
 
 TITLE = "Rendering by waves and one ray at a time"
 COLUMNS: Columns = {

@@ -24,7 +24,7 @@ from wrt.lab.bench.timing import quartiles, shown, spread
 from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable
 from wrt.lab.plans import Mitsuba as Plan
 from wrt.renderer.options import Options
-from wrt.renderer.renderer import Renderer
+from wrt.renderer.render import Renderer
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene

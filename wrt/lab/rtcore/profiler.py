@@ -23,9 +23,9 @@ from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
+from wrt.renderer.film import Rectangle
 from wrt.renderer.options import Options, ProfileOptions, Progress
 from wrt.renderer.plan import plan_of
-from wrt.renderer.tiles import Rectangle
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS

@@ -16,14 +16,13 @@ from wrt.core.errors import InputError
 from wrt.core.types import Device
 from wrt.io.load import as_scene
 from wrt.kernels.loops import record
-from wrt.renderer.film_arrays import DeviceFilm
+from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.inspector.assemble import Assembler
 from wrt.renderer.inspector.inspection import Inspection
 from wrt.renderer.inspector.tree import Sample
 from wrt.renderer.options import Options, PixelOptions
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import prepare
-from wrt.renderer.tiles import Work
 from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene

@@ -1,7 +1,10 @@
-"""The film on the device. With a target error, a pixel's samples form several groups, which estimate the error."""
+"""The film on the device, and the tiles of a picture. With a target error, a pixel's samples form groups, which estimate the error."""
 
 import math
+from collections.abc import Iterator
 from copy import copy
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -9,9 +12,9 @@ import warp as wp
 from wrt.core.device import upload
 from wrt.core.types import Device, WarpArray
 from wrt.kernels import structs
-from wrt.renderer.features import filter_icdf
 from wrt.scene.settings import MAX_DEPTH, Settings
 
+Rectangle = tuple[int, int, int, int]  # x, y, width, height
 # Number of groups with a target error; each is an independent sequence. Eight groups estimate a picture's error no better than four. They
 # have up to 1.4 times the error of four, because longer sequences converge faster.
 GROUPS = 4
@@ -23,6 +26,51 @@ VISIBLE = 0.05  # Smallest difference, as a share of the surrounding brightness,
 SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32,
           "clamped": wp.float32}
 OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
+
+
+class Work(NamedTuple):
+    """Work for a tracer: the samples `first` to `first + n - 1` of each pixel of a rectangle."""
+
+    rectangle: Rectangle
+    first: int
+    n: int
+
+    @property
+    def total(self) -> int:
+        """Number of samples, summed over the pixels."""
+        return self.rectangle[2] * self.rectangle[3] * self.n
+
+
+def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
+    """Yield the tiles that cover `crop` (x0, y0, x1, y1), row by row: squares of side `step`, cut at the right and bottom edges."""
+    x0, y0, x1, y1 = crop
+    for y in range(y0, y1, step):
+        for x in range(x0, x1, step):
+            yield x, y, min(step, x1 - x), min(step, y1 - y)
+
+
+def corners(rectangle: Rectangle) -> tuple[int, int, int, int]:
+    """Return x0, y0, x1, y1 of a rectangle x, y, width, height."""
+    x, y, width, height = rectangle
+    return x, y, x + width, y + height
+
+
+@cache
+def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
+    """Return the inverse cumulative distribution of a pixel filter along x or y, (size,) float32, in pixels from the centre.
+
+    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: the four-term window, 3 pixels wide (Harris 1978). Kernels
+    interpolate linearly, which widens the tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3."""
+    x = np.linspace(-1.5, 1.5, 20001)
+    if name == "gaussian":
+        density = np.exp(-2.0 * x * x) - np.exp(-2.0 * 1.5 * 1.5)
+    elif name == "blackman-harris":
+        phase = 2.0 * np.pi * (x / 3.0 + 0.5)
+        density = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
+    else:
+        return np.zeros(2, np.float32)
+    cdf = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)
 
 
 class DeviceFilm:

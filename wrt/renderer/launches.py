@@ -1,4 +1,6 @@
-"""Rendering on the CPU in waves of samples (wrt.kernels.loops.wave): kernels, working memory and launches."""
+"""The launches that render a picture: one ray at a time (wrt.kernels.loops.one_ray), on CUDA and if a CPU counts rays; else in waves.
+
+The waves of a CPU (wrt.kernels.loops.wave) need kernels, working memory for each thread, and launches that are recorded once."""
 
 from __future__ import annotations
 
@@ -14,11 +16,12 @@ import warp as wp
 from wrt.accel.queries.batches import new_scratch
 from wrt.accel.queries.raw_launches import Launches
 from wrt.accel.structure import Structure
-from wrt.core.device import made_once, records, start, upload
+from wrt.core.device import launch_on, made_once, records, start, upload
 from wrt.core.threads import FreeList
-from wrt.core.types import Kernel, WarpArray, WarpStruct, WarpType
+from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
+from wrt.kernels.loops.one_ray import Tile, add_samples
 from wrt.kernels.loops.state import BLOCK
 from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
 from wrt.kernels.shade.features import Features
@@ -28,9 +31,10 @@ from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import PendingLight, Sample
 from wrt.kernels.wide.stream import BatchTraversal
-from wrt.renderer.film_arrays import AovFilm, DeviceFilm
-from wrt.renderer.tiles import Work
+from wrt.renderer.film import AovFilm, DeviceFilm, Work
 
+THREADS_OF_SM = 2048  # resident threads of NVIDIA's largest multiprocessors
+ROUNDS = 4  # threads in one launch for each resident thread
 # Largest number of samples in a wave. With 4,096 to 32,768, renders are 0.92 to 1.06 times as fast as with 16,384, depending on the scene.
 CAPACITY = 16384
 MAX_SLOTS = 1 << 18  # Largest number of stack entries, and of shadow rays, of all samples of a wave together.
@@ -46,6 +50,55 @@ class SceneRecords(NamedTuple):
     surfaces: WarpStruct
     lighting: WarpStruct
     camera: WarpStruct
+
+def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm,
+                always_by_pixels: bool) -> Callable[[Work], int]:
+    """Return a function that adds the samples of a Work to the film by threads that trace one ray at a time, and returns their number.
+
+    A thread renders all samples of a pixel or, if the pixels are too few to occupy a GPU, one sample. limits: a struct Limits for each
+    group of the film."""
+    most_threads = 0 if always_by_pixels else device.sm_count * THREADS_OF_SM * ROUNDS
+    samples = wp.empty(0, dtype=Sample, device=device)
+
+    def trace(work: Work) -> int:
+        nonlocal samples
+        pixels, end = work.rectangle[2] * work.rectangle[3], work.first + work.n
+        by_samples = work.n > 1 and pixels * ROUNDS <= most_threads
+        step = min(most_threads // pixels, work.n) if by_samples else work.n
+        if by_samples and len(samples) < pixels * step:
+            samples = wp.empty(pixels * step, dtype=Sample, device=device)
+        for first in range(work.first, end, step):
+            tile = tile_of(work._replace(first=first, n=min(step, end - first)))
+            tile.threads = tile.n_samples if by_samples else 1
+            tile.samples = samples
+            for limit, group in zip(limits, film.groups, strict=True):
+                launch_on(device, kernel, pixels * tile.threads, *scene, limit, group, tile)
+                if tile.threads > 1:
+                    launch_on(device, add_samples, pixels, group, tile)
+        return work.total
+
+    return trace
+
+
+def aov_launch(device: Device, kernel: Kernel, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
+    """Return a function that writes the AOVs of a Work's rectangle to the film, and returns the number of pixels."""
+
+    def trace(work: Work) -> int:
+        launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], scene.accel, scene.surfaces, scene.camera, film.struct,
+                  tile_of(work))
+        return work.total
+
+    return trace
+
+
+def tile_of(work: Work) -> WarpStruct:
+    tile = Tile()
+    tile.x, tile.y, tile.width, _ = work.rectangle
+    tile.first_sample, tile.n_samples, tile.threads = work.first, work.n, 1
+    return tile
+
+
+# --- waves ------------------------------------------------------------------------------------------------------------
 
 
 def keep_only(features: Features, names: tuple[str, ...]) -> Features:

@@ -1,0 +1,222 @@
+"""Dask workers in other processes render the same bits as this process, even if one of them is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wrt
+from tests.command_line import BOX_OBJ
+from tests.command_line import wrt as run
+from tests.data import ROOT
+from tests.refused import refused
+from tests.wrt.renderer.test_checkpoint import SCENE, same
+from wrt.core.errors import InputError
+from wrt.picture.film import Film
+from wrt.picture.image import read_channels
+from wrt.renderer import cluster
+from wrt.renderer.render import render
+
+distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+dask = pytest.importorskip("dask", reason="needs the extra cluster")
+
+HOW: dict[str, Any] = {"tile_size": 24, "pass_size": 8, "aov": "depth"}  # few tiles, since each call takes a hundredth of a second
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[Any]:
+    """Start two workers, each a process with one thread."""
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as started:
+        yield started
+
+
+@pytest.fixture
+def client(local: Any) -> Iterator[Any]:
+    with distributed.Client(local, set_as_default=False) as one:
+        one.wait_for_workers(2, timeout=60)  # a killed worker is restarted
+        yield one
+
+
+@pytest.fixture
+def threads() -> Iterator[Any]:
+    """Start a scheduler and a worker in this process, which takes no time."""
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", silence_logs=50,
+                                  dashboard_address=":0") as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def whole() -> Film:
+    return render(SCENE, aov="depth")
+
+
+def test_the_picture_is_the_same(client: Any, whole: Film) -> None:
+    film = render(SCENE, executor=client, **HOW)
+    assert same(film, whole)
+    assert {int(name.split(":")[1]) for name in film.stats["workers"]} == set(client.run(os.getpid).values())
+    again = render(SCENE, executor=client, target_error=0.02, crop=(3, 4, 50, 30), tile_size=24)
+    assert same(again, render(SCENE, target_error=0.02, crop=(3, 4, 50, 30)))
+
+
+def dies_in_a_tile(flag: str) -> None:
+    """Run on a worker: the first process that traces a tile is killed."""
+    from wrt.renderer.prepare import Prepared
+
+    trace = Prepared.trace_tile
+
+    def deadly(self: Any, work: Any, *rest: Any) -> Any:
+        arrays = trace(self, work, *rest)
+        if work.first >= 4:
+            try:
+                os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                return arrays
+            os.kill(os.getpid(), signal.SIGKILL)
+        return arrays
+
+    Prepared.trace_tile = deadly  # type: ignore[method-assign]
+
+
+def test_a_killed_worker_costs_only_its_tiles(client: Any, whole: Film, tmp_path: Path) -> None:
+    before = set(client.run(os.getpid).values())
+    client.run(dies_in_a_tile, str(tmp_path / "flag"))
+    seen: list[int] = []
+    film = render(SCENE, executor=client, progress=lambda progress: seen.append(progress.done), **HOW)
+    assert os.listdir(tmp_path) == ["flag"]
+    assert same(film, whole) and seen == sorted(seen)
+    assert len(before - set(client.run(os.getpid).values())) == 1
+
+
+def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: Path, whole: Film) -> None:
+    path = tmp_path / "a.checkpoint"
+
+    def progress(progress: Any) -> None:
+        if progress.done > 4 * 61 * 34:
+            threads.close()
+
+    with distributed.Client(threads, set_as_default=False, timeout=1) as one, refused("executor", "workers are lost"):
+        render(SCENE, executor=one, checkpoint=path, progress=progress, **HOW)
+    film = render(SCENE, checkpoint=path, resume=True, aov="depth")
+    assert film.stats["resumed"]["samples"] >= 1 and same(film, whole)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_error_on_a_worker_is_the_one_that_is_raised(threads: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(self: Any, work: Any, *rest: Any) -> Any:
+        raise InputError("not this scene", path="a.toml")
+
+    monkeypatch.setattr("wrt.renderer.prepare.Prepared.trace_tile", fails)
+    with distributed.Client(threads, set_as_default=False) as one, refused(what="not this scene", path="a.toml"):
+        render(SCENE, executor=one)
+
+
+def test_a_worker_with_another_installation_is_refused(client: Any) -> None:
+    def set_version(version: str) -> None:
+        from wrt.renderer.cluster import INSTALLED
+
+        INSTALLED["Warp"] = version
+
+    first = next(iter(client.scheduler_info()["workers"]))
+    client.run(set_version, "0.9", workers=[first])
+    try:
+        with refused(what=f"worker {first} has Warp 0.9 (here {cluster.INSTALLED['Warp']})"):
+            render(SCENE, executor=client)
+    finally:
+        client.run(set_version, cluster.INSTALLED["Warp"], workers=[first])
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "box.obj"
+    path.write_text(BOX_OBJ)
+    return path
+
+
+def test_commands(threads: Any, mesh: Path) -> None:
+    address = threads.scheduler_address
+    for name, where in (("here", ()), ("there", ("--cluster", address)), ("devices", ("--device", "cpu,cpu"))):
+        done = run("render", mesh, "-o", f"{name}.exr", "--size", "64x36", "--spp", 4, "--json", "-q", *where)
+        assert done.code == 0 and json.loads(done.out)["samples"] == 64 * 36 * 4, done.err
+    here = read_channels("here.exr")
+    for name in ("there", "devices"):
+        other = read_channels(f"{name}.exr")
+        assert here.keys() == other.keys() and all(np.array_equal(here[layer], other[layer]) for layer in here)
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    block = page.split("```python\n")[1].split("```")[0]
+    assert block.count("tcp://scheduler:8786") == 1
+    names: dict[str, Any] = {"wrt": wrt, "scene": SCENE}
+    exec(block.replace("tcp://scheduler:8786", address).replace("spp=4096", "spp=2"), names)
+    names["Client"].current().close()
+    done = run("render", mesh, "--cluster", address, "--device", "cpu,cpu")
+    assert done.code == 2 and len(done.errors) == 1 and "a worker for each device" in done.err
+
+
+def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        for address in (f"tcp://127.0.0.1:{closed.getsockname()[1]}", "nonsense", "", "ftp://127.0.0.1:1"):
+            done = run("render", mesh, "--cluster", address)
+            assert done.code == 2 and len(done.errors) == 1 and "no Dask scheduler at" in done.err, (address, done)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    done = run("render", mesh, "--cluster", "tcp://127.0.0.1:1")
+    assert done.code == 2 and len(done.errors) == 1 and "pip install 'wrt[cluster]'" in done.err
+    assert not list(mesh.parent.glob("*.png"))
+
+
+def test_a_scheduler_without_workers(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "WORKER_SECONDS", 0.3)
+    with distributed.LocalCluster(n_workers=0, protocol="tcp://", dashboard_address=":0", silence_logs=50) as empty:
+        done = run("render", mesh, "--cluster", empty.scheduler_address)
+    assert done.code == 2 and len(done.errors) == 1 and "no worker at tcp://" in done.err and "dask worker tcp://" in done.err
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """Return the certificate and the key that docs/cluster.md describes; both files give access to the cluster."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl, to make a certificate")
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^openssl [^#]*", page, re.MULTILINE)
+    done = subprocess.run(line.split(), cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return tmp_path / "wrt.pem", tmp_path / "wrt.key"
+
+
+def test_tls(certificate: tuple[Path, Path], mesh: Path) -> None:
+    """Dask's configuration, from the environment, turns TLS on; wrt needs no option for it."""
+    file, key = map(str, certificate)
+    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+    values = {"$PWD/wrt.pem": file, "$PWD/wrt.key": key, "true": True}
+    config = {name.lower().replace("__", "."): values[value] for name, value in re.findall(r"DASK_(DISTRIBUTED__\w+)=(\S+)", page)}
+    assert len(config) == 8 and config["distributed.comm.require_encryption"]
+    with dask.config.set(config), distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, protocol="tls://", security=distributed.Security(), silence_logs=50,
+            dashboard_address=":0") as guarded:
+        address = guarded.scheduler_address
+        assert address.startswith("tls://")
+        done = run("render", mesh, "-o", "there.exr", "--size", "32x18", "--spp", 2, "-q", "--cluster", address)
+        assert done.code == 0 and Path("there.exr").exists(), done.err
+        with dask.config.set(dict.fromkeys(name for name in config if "scheduler" not in name and "worker" not in name)):
+            for wrong in (address, address.replace("tls://", "tcp://")):
+                done = run("render", mesh, "-o", "a.exr", "-q", "--cluster", wrong)
+                assert done.code == 2 and len(done.errors) == 1 and f"no Dask scheduler at '{wrong}'" in done.err, done
+    assert not Path("a.exr").exists()

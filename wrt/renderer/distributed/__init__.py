@@ -1,1 +1,0 @@
-"""One picture by several workers: GPUs, executors, a Dask cluster."""

@@ -1,0 +1,265 @@
+"""Renders that workers share: the devices of this machine, any executor, or a Dask cluster. The pixels have the bits of one device.
+
+A tile is a pure function of the scene, the samples to trace and the tile's previous state (Prepared.trace_tile). Any worker can compute
+it, also again after another worker died. A worker process prepares a scene once, and keeps it under a key. This process keeps the film
+and controls passes, limits and checkpoints (wrt.renderer.schedule).
+"""
+
+import math
+import os
+import pickle
+import socket
+import threading
+import time
+import warnings
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from contextlib import closing, nullcontext
+from dataclasses import replace
+from hashlib import sha256
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+from wrt.core.compiling import WATCH
+from wrt.core.device import start
+from wrt.core.errors import InputError, SceneWarning
+from wrt.core.threads import Pool
+from wrt.picture.film import Film
+from wrt.renderer.checkpoint import checkpoint_of
+from wrt.renderer.cluster import INSTALLED, check_installed, check_workers
+from wrt.renderer.film import AovFilm, DeviceFilm, Rectangle, Work, tiles
+from wrt.renderer.options import Options, Progress
+from wrt.renderer.plan import Plan, plan_of
+from wrt.renderer.prepare import Prepared, kind_of, prepare
+from wrt.renderer.schedule import STEP_SECONDS, Facts, Run, Steps
+from wrt.renderer.upload import warn_left_out
+from wrt.scene.digest import digest
+from wrt.scene.model import Scene
+
+QUEUED = 3  # Submitted jobs for each slot, so that no worker is idle.
+SLOTS = 32  # Assumed number of slots of an executor that does not state it.
+CACHED = 2  # Largest number of prepared scenes in a worker process.
+TILES_EACH = 4  # Tiles of a pass for each slot.
+SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: smaller tiles cost more to send, larger tiles take long
+OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")
+LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
+
+Job = tuple[Any, ...]  # The name of a method of Prepared, and its arguments.
+Reply = tuple[str, str, Any]  # The worker's name, the kind of its device (kind_of), and the result of the method.
+
+
+# --- in a worker ------------------------------------------------------------------------------------------------------
+
+
+class Package(NamedTuple):
+    """What a worker needs to prepare a scene. The scene is pickled by itself, so that another installation is refused before."""
+
+    installed: dict[str, str]
+    kernels: str  # Plan.kernels_hash.
+    options: dict[str, Any]
+    scene: bytes
+
+
+_ready: OrderedDict[str, Prepared] = OrderedDict()
+_lock = threading.Lock()
+
+
+def call(key: str, package: Package | None, method: str, *arguments: object) -> Reply | None:
+    """Call a method of the prepared scene (Prepared) that this worker keeps under `key`, after preparing it from `package` if needed.
+
+    Returns None if the scene is missing and `package` is None. Raises InputError if the caller has a different installation."""
+    with _lock:
+        if key not in _ready:
+            if package is None:
+                return None
+            check_installed(worker_name(), INSTALLED, package.installed)
+            prepared = _prepared(pickle.loads(package.scene), Options(**package.options))
+            if prepared.plan.kernels_hash() != package.kernels:
+                raise InputError(f"worker {worker_name()} generates other kernels from the same code")
+            _ready[key] = prepared
+        _ready.move_to_end(key)
+        while len(_ready) > CACHED:
+            _ready.popitem(last=False)
+        prepared = _ready[key]
+    return worker_name(), kind_of(prepared.device), getattr(prepared, method)(*arguments)
+
+
+def _prepared(scene: Scene, options: Options) -> Prepared:
+    plan, device = plan_of(scene, options), start(options.device)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SceneWarning)  # the caller reports the warnings
+        return prepare(plan, device)
+
+
+def worker_name() -> str:
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+class Devices:
+    """Several devices of this machine. Each has a thread of a pool, which prepares the scene and runs jobs."""
+
+    def __init__(self, scene: Scene, options: Options, names: tuple[str, ...]) -> None:
+        self.scene, self.options = scene, replace(options, **LOCAL)
+        self.free: SimpleQueue[tuple[str, str, Prepared | None]] = SimpleQueue()  # one entry for each thread
+        for i, name in enumerate(names):
+            self.free.put((f"{name} ({i})", name, None))
+        self.lock = threading.Lock()
+
+    def call(self, method: str, *arguments: Any) -> Reply:
+        label, name, prepared = self.free.get()
+        try:
+            if prepared is None:
+                with self.lock:  # the first device of a kind compiles the kernels for all devices of that kind
+                    prepared = _prepared(self.scene, replace(self.options, device=name))
+            return label, kind_of(prepared.device), getattr(prepared, method)(*arguments)
+        finally:
+            self.free.put((label, name, prepared))
+
+
+# --- in the process that renders --------------------------------------------------------------------------------------
+
+
+class Workers(NamedTuple):
+    """Workers of any kind.
+
+    - submit: starts a job, and returns the Future of its Reply. The reply is None if the worker lacks the scene, which then goes with
+      one more job for each such reply: if `send`, the job carries the scene.
+    - slots: number of jobs that can run at once. argument: the option that an error names."""
+
+    submit: Callable[[bool, Job], "Future[Reply | None]"]
+    slots: int
+    argument: str
+
+    def run(self, jobs: Iterable[Job]) -> Generator[tuple[Job, Reply] | None, None, None]:
+        """Run jobs. Yield each job with its reply, in any order. While no reply comes, yield None every tenth of a second.
+
+        A job is taken from `jobs` just before it is submitted. When the caller closes the generator, waiting jobs are cancelled."""
+        coming, again = iter(jobs), deque[Job]()
+        pending: dict[Future[Reply | None], Job] = {}
+        requests, done = 0, False
+        try:
+            while pending or again or not done:
+                while len(pending) < QUEUED * self.slots:
+                    job = again.popleft() if again else next(coming, None)
+                    if job is None:
+                        done = True
+                        break
+                    try:
+                        pending[self.submit(requests > 0, job)] = job
+                    except Exception as error:  # the executor or its connection is closed
+                        raise self.lost(error) from error
+                    requests = max(requests - 1, 0)
+                finished = wait(pending, timeout=STEP_SECONDS, return_when=FIRST_COMPLETED).done
+                for future in finished:
+                    job, reply = pending.pop(future), future.result()
+                    if reply is None:
+                        again.append(job)
+                        requests += 1
+                    else:
+                        yield job, reply
+                if not finished:
+                    yield None
+        except (BrokenExecutor, CancelledError, OSError) as error:
+            raise self.lost(error) from error
+        finally:
+            for future in pending:
+                future.cancel()
+
+    def lost(self, error: BaseException) -> InputError:
+        return InputError(f"its workers are lost: {error or type(error).__name__}", argument=self.argument)
+
+
+def workers_for(plan: Plan) -> Workers:
+    """Return the workers that the plan's options name."""
+    scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None, accel=plan.accel)
+    if options.devices is not None:
+        devices, pool = Devices(scene, options, tuple(options.devices)), Pool(len(options.devices))
+        return Workers(lambda send, job: pool.submit(devices.call, *job), len(options.devices), "devices")
+    sent = {name: getattr(options, name) for name in OPTIONS_SENT}
+    package = Package(INSTALLED, plan.kernels_hash(), sent, pickle.dumps(scene, pickle.HIGHEST_PROTOCOL))
+    key = sha256(f"{package[:3]}{digest(scene)}{digest(plan.camera)}{scene.settings}".encode()).hexdigest()
+    executor: Any = options.executor
+    if hasattr(executor, "get_executor"):  # Dask's Client
+        check_workers(executor)
+        (there,) = executor.scatter([package], broadcast=True, hash=False)
+        slots, executor = max(1, sum(executor.nthreads().values())), executor.get_executor(pure=False)
+        return Workers(lambda send, job: executor.submit(call, key, there, *job), slots, "executor")
+    slots = int(getattr(executor, "_max_workers", None) or SLOTS)
+    return Workers(lambda send, job: executor.submit(call, key, package if send else None, *job), slots, "executor")
+
+
+class WorkersTracer:
+    """A scene that workers have prepared. It implements Tracer (wrt.renderer.schedule)."""
+
+    def __init__(self, plan: Plan, workers: Workers) -> None:
+        self.device = start("cpu")  # the film's device
+        self.plan, self.workers, self.tiles_by = plan, workers, Counter[str]()
+        begin, progress, replies = time.perf_counter(), plan.options.progress, list[Reply]()
+        with nullcontext() if progress is None else WATCH.reported_by_caller():
+            for done in workers.run([("ready",)] * workers.slots):
+                seconds = time.perf_counter() - begin
+                if done is not None:
+                    replies.append(done[1])
+                elif progress is not None and seconds >= WATCH.delay:
+                    progress(Progress(0, 100, 0, seconds, stage="compile"))
+                    progress = None
+        self.kind, self.counts = replies[0][1], replies[0][2]["facts"]
+        for reply in replies:
+            self._check(reply)
+        slowest: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: max(each.values()))
+        waited = time.perf_counter() - begin  # shorter, if the worker has prepared the scene for an earlier render
+        self.seconds = {name: min(value, waited) for name, value in slowest.items()}
+
+    def _check(self, reply: Reply) -> None:
+        if reply[1] != self.kind:
+            raise InputError("the workers' devices are of several kinds, which round differently:"
+                             f" {self.kind}, and {reply[1]} of {reply[0]}")
+
+    def facts(self) -> Facts:
+        return {**self.counts, "workers": dict(self.tiles_by)}
+
+    def tiles(self, samples: int) -> Iterator[Rectangle]:
+        """Yield the tiles of a pass. Tiles are large for any number of samples, since a call to a worker costs more than a wave."""
+        low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
+        side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots)))
+        return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
+
+    def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
+        """Trace as Tracer.trace does. The film receives finished tiles only, so that each step may report that no tile is running."""
+        jobs: Iterable[Job]
+        if isinstance(film, AovFilm):
+            views = [film.view(name) for name in self.plan.options.aov]
+            jobs = (("aov_tile", part) for part in work)
+        else:
+            views = [film.view(array) for _, array in film.arrays()]
+            jobs = (("trace_tile", part, film.seed, [view[self._place(part.rectangle)] for view in views] if part.first else None)
+                    for part in work)
+        total, next_step = 0, 0.0
+        with closing(self.workers.run(jobs)) as running:
+            for done in running:
+                if done is not None:
+                    (_, part, *_), reply = done
+                    self._check(reply)  # a new worker may have connected meanwhile
+                    self.tiles_by[reply[0]] += 1
+                    total += part.total
+                    for view, array in zip(views, reply[2], strict=True):
+                        view[self._place(part.rectangle)] = array
+                if time.monotonic() >= next_step:
+                    yield total, True
+                    next_step = time.monotonic() + STEP_SECONDS
+            yield total, True
+
+    def _place(self, rectangle: Rectangle) -> tuple[slice, slice]:
+        x, y, width, height = rectangle
+        x, y = x - self.plan.crop[0], y - self.plan.crop[1]
+        return slice(y, y + height), slice(x, x + width)
+
+
+def render_with_workers(scene: Scene, options: Options) -> Film:
+    """Render a scene for options with `devices` or `executor`."""
+    plan = plan_of(scene, options)
+    plan.require_memory(start("cpu"))
+    warn_left_out(scene)
+    tracer = WorkersTracer(plan, workers_for(plan))
+    return Run(tracer, checkpoint_of(plan, tracer.kind) if options.checkpoint is not None else None).film()
