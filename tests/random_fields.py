@@ -15,8 +15,9 @@ import numpy as np
 
 from wrt.core.checks import LARGEST
 from wrt.core.errors import InputError
-from wrt.scene.kinds import Limits, forms
+from wrt.scene.kinds import forms
 from wrt.scene.materials import WRAPS, Texture
+from wrt.scene.values import Limits
 
 Rng = np.random.Generator
 Draw = Callable[[Rng], Any]
@@ -84,7 +85,7 @@ def fixed(value: Any) -> Draw:
     return lambda rng: value
 
 
-# For each form in wrt.scene.kinds.FORMS, a function of the group's generator and the field's limits. None: random_scenes draws it.
+# For each form in wrt.scene.values.FORMS, a function of the group's generator and the field's limits. None: random_scenes draws it.
 DRAWS: dict[str, Callable[[Rng, Limits], Draw] | None] = {
     "point": lambda group, limits: lambda rng: rng.uniform(-4.0, 4.0, 3),
     "direction": lambda group, limits: lambda rng: rng.normal(size=3),

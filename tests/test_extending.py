@@ -196,7 +196,8 @@ assert np.allclose(film.aov["depth"], 3.0, rtol=1e-6)  # from the middle of a sp
 assert np.allclose(film.pixels[..., 0], 0.25, atol=1e-5)
 
 import pickle
-from wrt.io.toml.reference_page import scene_format
+
+from docs.site.scene_format import scene_format
 from wrt.scene.digest import digest
 
 (back,) = pickle.loads(pickle.dumps(scene)).cameras

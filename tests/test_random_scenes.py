@@ -9,8 +9,9 @@ from tests.random_scenes import Outcome, plan_of_scene, render
 from wrt.renderer.features import switches
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS
-from wrt.scene.kinds import FORMS, forms
+from wrt.scene.kinds import forms
 from wrt.scene.settings import Settings
+from wrt.scene.values import FORMS
 
 # Together these groups use every feature. If a new feature is in none of them, choose other groups.
 GROUPS = 95, 118, 137, 144

@@ -34,14 +34,8 @@ def info(scene: Path, camera: str | None, assignments: Assignments, as_json: boo
 
 
 @click.command()
-@click.option("--markdown", is_flag=True, help="Print the reference page docs/scene_format.md instead")
-def schema(markdown: bool) -> None:
+def schema() -> None:
     """Print the JSON Schema of scene files."""
-    if markdown:
-        from wrt.io.toml.reference_page import scene_format
-
-        click.echo(scene_format(), nl=False)
-        return
     from wrt.io.load import schema as scene_schema
 
     click.echo(json.dumps(scene_schema(), indent=2))

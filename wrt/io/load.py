@@ -13,7 +13,6 @@ import numpy as np
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import read_file, require_file, utf8
-from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
@@ -80,17 +79,14 @@ def as_scene(value: Scene | Mesh | PathLike) -> Scene:
 
 def schema() -> JsonObject:
     """Return the JSON Schema (draft 2020-12) of TOML scene files."""
-    with needed_by("the schema of TOML scenes"):
-        from wrt.io.toml.schema import scene_table
+    from wrt.io.toml.schema import scene_schema
 
-    dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": dialect, **scene_table().model_json_schema(), "title": "wrt scene"}
+    return {**scene_schema()}
 
 
 def _load_toml(path: Path, staging: Staging) -> Scene:
-    with needed_by("a TOML scene"):
-        from wrt.io.toml.build import build
-        from wrt.io.toml.report import check
+    from wrt.io.toml.build import build
+    from wrt.io.toml.report import check
 
     return _staged(build(check(_parse(path), path), path), path, staging)
 

@@ -1,13 +1,18 @@
-"""Checks of the numbers, vectors, colours and transforms of a scene."""
+"""Checks of the values of a scene: numbers, vectors, colours, transforms, and the forms of described fields (wrt.scene.kinds)."""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, shown
+from wrt.core.checks import LARGEST, as_array, as_choice, as_integer, as_one, as_size, shown
 from wrt.core.errors import InputError, warn, wrong
 
 Color = tuple[float, float, float]
+Limits = dict[str, Any]  # limits of a described field: the keywords of wrt.scene.kinds.given
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -137,8 +142,41 @@ def require_count(count: int, what: str) -> None:
         raise InputError(f"{count} {what}", hint=f"a scene holds at most {MAX_OBJECTS}")
 
 
-def _unit(vector: Color, what: str) -> Color:
+def as_direction(value: object, what: str) -> Color:
+    """Return a vector of any length scaled to length 1. A vector that has this length already keeps its bits, as `Scene.save` needs."""
+    vector = as_vector(value, what)
     length = math.hypot(*vector)
     if length == 0.0:
         raise wrong(what, "must not be zero")
-    return (vector[0] / length, vector[1] / length, vector[2] / length)
+    return vector if abs(length - 1.0) <= 2.0**-51 else (vector[0] / length, vector[1] / length, vector[2] / length)
+
+
+def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
+    low = max(limits.get(each, -math.inf) for each in ("ge", "gt"))
+    high = min(limits.get(each, math.inf) for each in ("le", "lt"))
+    return as_number(value, what, low=low * unit, high=high * unit, unit="" if unit == 1.0 else "radians")
+
+
+def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
+    image = as_array(value, np.float32, what)
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise wrong(what, f"must be (H, W, 3), got {image.shape}")
+    if not np.isfinite(image).all() or (image < 0.0).any():
+        raise wrong(what, "must be finite and not negative")
+    return image
+
+
+# Forms of a field. The function of a form checks and converts a value. Its arguments: the value, its name in messages, the limits.
+FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
+    "point": lambda value, what, limits: as_vector(value, what),  # in world space; a transform moves it
+    "direction": lambda value, what, limits: as_direction(value, what),  # of any length, stored at 1; a transform turns it
+    "color": lambda value, what, limits: as_vector(value, what, low=0.0, high=limits.get("le", math.inf)),
+    "number": _number,
+    "angle": lambda value, what, limits: _number(value, what, limits, math.pi / 180.0),  # radians; degrees in files and limits
+    "whole": lambda value, what, limits: as_integer(value, what, limits["ge"], limits["le"]),
+    "flag": lambda value, what, limits: value,
+    "choice": lambda value, what, limits: as_choice(value, limits["among"], what),
+    "size": lambda value, what, limits: as_size(value, what),
+    "image": _image,  # (H, W, 3) float32 linear radiance; a scene file names an image file
+    "texture": lambda value, what, limits: as_one(value, limits["among"], what),
+}

@@ -3,39 +3,36 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from wrt.core.checks import unknown
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.io.toml.kinds import make, values_of
-from wrt.io.toml.meshes import Meshes
+from wrt.core.types import JsonObject
+from wrt.io.toml.meshes import Meshes, cosine_sine, transform
 from wrt.io.toml.report import raise_all, unknown_materials
-from wrt.io.toml.transforms import cosine_sine, transform
+from wrt.io.toml.schema import has_name
 from wrt.scene import shapes
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CAMERAS, Camera, CameraKind
-from wrt.scene.kinds import forms
+from wrt.scene.kinds import Kind, forms
 from wrt.scene.lights import LIGHTS, Light
 from wrt.scene.materials import CONDUCTORS, SLOTS, Checkerboard, Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
 
-if TYPE_CHECKING:
-    from wrt.io.toml import schema as tables
-    from wrt.io.toml.camera_schema import PoseTable
-    from wrt.io.toml.material_schema import ColorTextureTable, ImageTable, MaterialTable
-    from wrt.io.toml.values import Table, TypedTable
+K = TypeVar("K", bound=Kind)
 
 
-def build(table: tables.SceneTable, path: Path) -> Scene:
+def build(table: JsonObject, path: Path) -> Scene:
     """Make the scene of a checked scene file at `path`; the names of files in it are relative to the folder of `path`.
 
     A file that is named twice is read once, and its mesh or texture is shared. Raises one InputError that lists all unknown names,
@@ -70,49 +67,51 @@ class _Builder:
     def file(self, name: str) -> Path:
         return self.path.parent / name
 
-    def scene(self, table: tables.SceneTable) -> Scene | None:
-        for name, material in table.materials.items():
+    def scene(self, table: JsonObject) -> Scene | None:
+        materials = table.get("materials", {})
+        for name, material in materials.items():
             self.materials |= self.material(material, name, f"materials.{name}")
         included: list[Scene] = []
-        for i, entry in enumerate(table.include):
+        for i, entry in enumerate(table.get("include", [])):
             included += self.included(entry, f"include[{i}]")
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
         # A material with a mistake counts as known, so that the message has one line for it.
-        self.problems += unknown_materials(table.model_dump(exclude_unset=True), {**known, **table.materials})
+        self.problems += unknown_materials(table, {**known, **materials})
         self.materials = known
 
         objects: list[Object] = []
         spheres: list[Sphere] = []
         lights: list[Light] = []
         cameras: list[CameraKind] = []
-        for i, sphere in enumerate(table.spheres):
-            with self.at(f"spheres[{i}]"):
-                spheres += [Sphere(**{**sphere.given(), "material": m}) for m in self.material_named(sphere.material)]
-        for i, quad in enumerate(table.quads):
-            with self.at(f"quads[{i}]"):
-                mesh = shapes.quad(quad.corner, quad.edge_u, quad.edge_v)
-                objects += [Object(mesh, (m,), name=quad.name or f"quads[{i}]") for m in self.material_named(quad.material)]
-        for i, box in enumerate(table.boxes):
-            with self.at(f"boxes[{i}]"):
-                mesh, matrix = shapes.box(box.low, box.high), transform(box.transform)
-                objects += [Object(mesh, (m,), matrix, name=box.name or f"boxes[{i}]") for m in self.material_named(box.material)]
-        for i, each in enumerate(table.meshes):
-            with self.at(f"meshes[{i}]"):
-                objects += self.meshes.objects(each, f"meshes[{i}]", self.materials)
-        for i, light in enumerate(table.lights):
-            with self.at(f"lights[{i}]"):
-                made = self.light(light, light.name or f"lights[{i}]")
+        for place, sphere in self.each(table, "spheres"):
+            with self.at(place):
+                spheres += [Sphere(**{**sphere, "material": m}) for m in self.material_named(sphere["material"])]
+        for place, quad in self.each(table, "quads"):
+            with self.at(place):
+                mesh = shapes.quad(quad["corner"], quad["edge_u"], quad["edge_v"])
+                objects += [Object(mesh, (m,), name=quad.get("name") or place) for m in self.material_named(quad["material"])]
+        for place, box in self.each(table, "boxes"):
+            with self.at(place):
+                mesh, matrix = shapes.box(box["low"], box["high"]), transform(box.get("transform"))
+                objects += [Object(mesh, (m,), matrix, name=box.get("name") or place) for m in self.material_named(box["material"])]
+        for place, each in self.each(table, "meshes"):
+            with self.at(place):
+                objects += self.meshes.objects(each, place, self.materials)
+        for place, light in self.each(table, "lights"):
+            with self.at(place):
+                made = self.light(light, light.get("name") or place)
                 if isinstance(made, Object):
                     objects.append(made)
                 else:
                     lights.append(made)
-        for name, camera in table.cameras.items():
+        for name, camera in table.get("cameras", {}).items():
             with self.at(f"cameras.{name}"):
                 cameras.append(make_camera(camera, name))
         background: Background = ConstantBackground()
         with self.at("background"):
-            background = self.background(table)
+            if "background" in table:
+                background = self.make(BACKGROUNDS[table["background"]["type"]], table["background"], "")
         if self.problems:
             return None
         return Scene(
@@ -121,20 +120,24 @@ class _Builder:
             lights=(*lights, *(light for scene in included for light in scene.lights)),
             cameras=(*cameras, *(camera for scene in included for camera in scene.cameras)),
             background=background,
-            ambient=as_vector(table.ambient, "ambient"),
-            ambient_occlusion=table.ambient_occlusion,
-            settings=settings(table.settings, included),
-            name=table.title or self.path.stem,
+            settings=settings(table.get("settings", {}), included),
+            name=table.get("title") or self.path.stem,
+            **{key: table[key] for key in ("ambient", "ambient_occlusion") if key in table},
         )
+
+    @staticmethod
+    def each(table: JsonObject, key: str) -> list[tuple[str, JsonObject]]:
+        """Return the tables of a list in the file, each with its place."""
+        return [(f"{key}[{i}]", each) for i, each in enumerate(table.get(key, []))]
 
     def material_named(self, name: str) -> list[Material]:
         """Return [the material of a known name], or [] for an unknown name, which `unknown_materials` reports."""
         return [self.materials[name]] if name in self.materials else []
 
-    def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
+    def included(self, entry: str | JsonObject, place: str) -> list[Scene]:
         from wrt.io.gltf.reader import load_gltf
 
-        name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
+        name, to_world = (entry, None) if isinstance(entry, str) else (entry["file"], entry.get("transform"))
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
                 raise InputError(f"{name!r} is no .gltf or .glb file", hint="mesh files belong into [[meshes]]")
@@ -147,51 +150,47 @@ class _Builder:
             return [moved(scene, transform(to_world))]
         return []
 
-    def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
+    def overridden(self, included: list[Scene], table: JsonObject) -> list[Scene]:
         """Return the included scenes with materials replaced by the materials of the same name in [override]."""
         names = list(dict.fromkeys(m.name for scene in included for m in scene.materials))
         new: dict[str, Material] = {}
-        for name, material in table.override.items():
+        for name, material in table.get("override", {}).items():
             with self.at(f"override.{name}"):
-                if name not in names and len(included) == len(table.include):
+                if name not in names and len(included) == len(table.get("include", [])):
                     raise unknown(name, "included material", names)
             new |= self.material(material, name, f"override.{name}")
         return [replace(scene, objects=tuple(
             replace(thing, materials=tuple(new.get(m.name, m) for m in thing.materials)) for thing in scene.objects))
             for scene in included]
 
-    def material(self, table: MaterialTable, name: str, place: str) -> dict[str, Material]:
+    def material(self, table: JsonObject, name: str, place: str) -> dict[str, Material]:
         """Return {name: material}, or {} if the table has a mistake."""
-        fields = table.given("metal", *SLOTS)
-        if table.metal is not None:
-            fields["eta"], fields["k"] = CONDUCTORS[table.metal]
+        values = {key: value for key, value in table.items() if key != "metal" and key not in SLOTS}
+        if "metal" in table:
+            values["eta"], values["k"] = CONDUCTORS[table["metal"]]
         for slot, is_color in SLOTS.items():
-            texture = getattr(table, slot)
-            if texture is not None:
+            if slot in table:
                 with self.at(f"{place}.{slot}"):
-                    fields[slot] = self.texture(texture, is_color)
+                    values[slot] = self.texture(table[slot], is_color)
         with self.at(place):
-            return {name: Material(name=name, **fields)}
+            return {name: Material(name=name, **values)}
         return {}
 
-    def texture(self, table: ImageTable | ColorTextureTable, is_color: bool) -> Texture | Checkerboard:
-        key = (table.model_dump_json(), is_color)
+    def texture(self, table: JsonObject, is_color: bool) -> Texture | Checkerboard:
+        key = (json.dumps(table, sort_keys=True), is_color)
         if key not in self._textures:
-            if (checkerboard := getattr(table, "checkerboard", None)) is not None:
-                self._textures[key] = Checkerboard(**checkerboard.given())
-            else:
-                cosine, sine = cosine_sine(table.rotation)
-                (u, v), (du, dv) = table.scale, table.offset
-                # As in KHR_texture_transform: scale, then rotate (v points down), then translate.
-                placed = [[cosine * u, sine * v, du], [-sine * u, cosine * v, dv]]
-                self._textures[key] = Texture(
-                    self.image(self.file(str(table.file))),
-                    srgb=is_color if table.srgb is None else table.srgb,
-                    wrap=(table.wrap[0], table.wrap[1]),
-                    uv_transform=np.array(placed if table.matrix is None else table.matrix).reshape(2, 3),
-                    name=str(table.file),
-                )
+            self._textures[key] = Checkerboard(**table["checkerboard"]) if "checkerboard" in table else self.picture(table, is_color)
         return self._textures[key]
+
+    def picture(self, table: JsonObject, is_color: bool) -> Texture:
+        cosine, sine = cosine_sine(table.get("rotation", 0.0))
+        (u, v), (du, dv) = np.broadcast_to(table.get("scale", 1.0), 2), table.get("offset", (0.0, 0.0))
+        # As in KHR_texture_transform: scale, then rotate (v points down), then translate.
+        matrix = table.get("matrix", [cosine * u, sine * v, du, -sine * u, cosine * v, dv])
+        wrap = table.get("wrap", "repeat")
+        return Texture(self.image(self.file(table["file"])), srgb=table.get("srgb", is_color),
+                       wrap=(wrap, wrap) if isinstance(wrap, str) else tuple(wrap),
+                       uv_transform=np.array(matrix, np.float64).reshape(2, 3), name=table["file"])
 
     def image(self, path: Path) -> np.ndarray:
         from wrt.picture.decode import decode_rgba8
@@ -202,29 +201,41 @@ class _Builder:
             self._images[path].flags.writeable = False  # so that textures share it
         return self._images[path]
 
-    def background(self, table: tables.SceneTable) -> Background:
-        from wrt.picture.image import read_image
-
-        if table.background is None:
-            return ConstantBackground()
-        return make(BACKGROUNDS[table.background.type], table.background, "", lambda name: read_image(self.file(name), environment=True))
-
-    def light(self, table: TypedTable, name: str) -> Light | Object:
+    def light(self, table: JsonObject, name: str) -> Light | Object:
         """Return a light; for a rectangle light, an emissive object of albedo 0."""
-        from wrt.io.toml.schema import RectangleLightTable
+        if table["type"] != "rectangle":
+            return self.make(LIGHTS[table["type"]], table, name)
+        emission = as_vector(table["radiance"], "radiance")
+        material = Material(name=name, albedo=BLACK, emission=emission, two_sided=table.get("two_sided", False))
+        return Object(shapes.quad(table["corner"], table["edge_u"], table["edge_v"]), (material,), name=name)
+
+    def make(self, kind: type[K], table: JsonObject, name: str) -> K:
+        """Make the light or background of a table. An image is read, and its file gives the name."""
         from wrt.picture.image import read_image
 
-        if isinstance(table, RectangleLightTable):
-            material = Material(name=name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"), two_sided=table.two_sided)
-            return Object(shapes.quad(table.corner, table.edge_u, table.edge_v), (material,), name=name)
-        return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file), environment=True))
+        values: dict[str, Any] = ({"name": name} if has_name(kind) else {}) | values_of(kind, table)
+        for key, each in forms(kind).items():
+            if each.metadata["form"] == "image":
+                values |= {key: read_image(self.file(values[key]), environment=True), "name": values[key]}
+        return kind(**values)
 
 
-def settings(table: Table, included: Sequence[Scene]) -> Settings:
+def values_of(kind: type, table: JsonObject) -> dict[str, Any]:
+    """Return the values of a table by the class's field names: angles in radians, an image as the name of its file."""
+    values: dict[str, Any] = {}
+    for name, each in forms(kind).items():
+        form = each.metadata["form"]
+        key = "file" if form == "image" else name
+        if key in table:
+            values[name] = math.radians(table[key]) if form == "angle" else table[key]
+    return values
+
+
+def settings(table: JsonObject, included: Sequence[Scene]) -> Settings:
     """Return the settings of a scene file. glass_shadows is "tinted" by default if an included file has solid glass."""
     tinted = any(scene.settings.glass_shadows == "tinted" for scene in included)
     needed = {"glass_shadows": "tinted"} if tinted else {}
-    return Settings(**{**needed, **table.given()})
+    return Settings(**{**needed, **table})
 
 
 def moved(scene: Scene, matrix: np.ndarray) -> Scene:
@@ -239,18 +250,17 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
     )
 
 
-def make_camera(table: PoseTable, name: str) -> CameraKind:
+def make_camera(table: JsonObject, name: str) -> CameraKind:
     """Make a camera. Position and target or a matrix give its pose; fov_y or a real lens gives a perspective camera's angle of view."""
-    kind = CAMERAS[table.type]
+    kind = CAMERAS[table.get("type", Camera.kind)]
     values: dict[str, Any] = {}
-    if "focus_distance" in forms(kind) and table.position is not None and table.target is not None:
-        values["focus_distance"] = max(math.dist(table.position, table.target), SMALLEST)
+    if "focus_distance" in forms(kind) and "position" in table:
+        values["focus_distance"] = max(math.dist(table["position"], table["target"]), SMALLEST)
     values |= values_of(kind, table)
-    focal_length, sensor_height = (getattr(table, key, None) for key in ("focal_length", "sensor_height"))
-    if focal_length is not None and sensor_height is not None:
-        values |= Camera.lens(focal_length, values.get("focus_distance", 1.0), sensor_height,
-                              f_number=getattr(table, "f_number", None), aperture_radius=values.get("aperture_radius"))
-    if table.matrix is not None:
-        return kind.posed(np.array(table.matrix).reshape(4, 4), name=name, **values)
-    assert table.position is not None and table.target is not None  # as the schema checks
-    return kind.look_at(table.position, table.target, table.up, name=name, **values)
+    if "focal_length" in table:
+        values |= Camera.lens(table["focal_length"], values.get("focus_distance", 1.0), table["sensor_height"],
+                              f_number=table.get("f_number"), aperture_radius=values.get("aperture_radius"))
+    if "matrix" in table:
+        return kind.posed(np.array(table["matrix"], np.float64).reshape(4, 4), name=name, **values)
+    up = {"up": table["up"]} if "up" in table else {}
+    return kind.look_at(table["position"], table["target"], **up, name=name, **values)

@@ -1,60 +1,46 @@
-"""Checks of a TOML scene file against the schema, with a line for each mistake."""
+"""Checks of a TOML scene file against its schema, with a line for each mistake."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Sequence
+import math
+import operator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from wrt.core.checks import short, unknown
 from wrt.core.errors import InputError, InputErrors
 from wrt.core.types import JsonObject
-
-if TYPE_CHECKING:
-    from wrt.io.toml.schema import SceneTable
+from wrt.io.toml.schema import Schema, Table, scene_schema
+from wrt.scene.values import ROUNDING
 
 MOST = 20  # largest number of problems in the message about a file
-
-# The expected value by pydantic's type of error; {} is filled from the error's context.
-_EXPECTED = {
-    "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
-    "list_type": "an array", "dict_type": "a table", "model_type": "a table", "model_attributes_type": "a table",
-    "finite_number": "a finite number", "greater_than": "a number > {gt}", "greater_than_equal": "a number >= {ge}",
-    "less_than": "a number < {lt}", "less_than_equal": "a number <= {le}",
-    "too_short": "at least {min_length} values", "too_long": "at most {max_length} values",
+# The types of a schema: in words, and in Python.
+TYPES: dict[str, tuple[str, tuple[type, ...]]] = {
+    "number": ("a number", (int, float)), "integer": ("a whole number", (int,)), "string": ("text", (str,)),
+    "boolean": ("true or false", (bool,)), "array": ("an array", (list,)), "object": ("a table", (dict,)),
 }
+# The limits of a schema: in signs, and the comparison that is true of a value beyond.
+LIMITS = {"minimum": (">=", operator.lt), "exclusiveMinimum": (">", operator.le), "maximum": ("<=", operator.gt),
+          "exclusiveMaximum": ("<", operator.ge)}
 
 
-def check(data: JsonObject, path: Path) -> SceneTable:
-    """Convert the tables of a scene file to pydantic models. Raises one InputError that lists all mistakes."""
-    from wrt.io.toml.schema import scene_table
-
-    materials = data.get("materials")
+def check(data: JsonObject, path: Path) -> JsonObject:
+    """Return the tables of a scene file unchanged. Raises one InputError that lists all mistakes."""
+    schema, materials = scene_schema(), data.get("materials")
     known = materials if isinstance(materials, dict) else {}
-    return _models(scene_table(), data, path, [] if data.get("include") else unknown_materials(data, known))
+    raise_all([*mistakes(data, schema, "", schema["$defs"]), *([] if data.get("include") else unknown_materials(data, known))], path)
+    return data
 
 
 def check_settings(values: JsonObject, origin: str) -> JsonObject:
     """Check settings by the rules of [settings] in a scene file. Raises one InputError that begins with `origin` and lists all mistakes."""
-    from wrt.io.toml.schema import SceneTable, SettingsTable
-
+    schema = scene_schema()
     for name in values:
-        if name in SceneTable.model_fields:
+        if name in schema["properties"]:
             raise InputError("is a key of the scene, not of its settings", path=origin, place=name, hint="write it into the scene file")
-    return _models(SettingsTable, values, Path(origin)).given()
-
-
-def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[InputError] = ()) -> Any:
-    """Convert `data` to the pydantic model `table`. If it has mistakes, raises one InputError that lists the mistakes and `others`."""
-    from pydantic import ValidationError
-
-    known_keys: dict[int, list[str]] = {}
-    try:
-        return table.model_validate(data, context=known_keys)
-    except ValidationError as error:
-        problems = [_line(each, data, known_keys) for each in error.errors(include_url=False)]
-    raise_all([*problems, *others], path)
+    raise_all([*mistakes(values, schema["$defs"]["SettingsTable"], "", schema["$defs"])], Path(origin))
+    return values
 
 
 def raise_all(problems: Sequence[InputError], path: Path) -> None:
@@ -67,8 +53,65 @@ def raise_all(problems: Sequence[InputError], path: Path) -> None:
         raise InputErrors("\n  ".join([f"{len(lines)} errors", *list(lines)[:MOST], *more]), list(lines.values()), path=path)
 
 
+def mistakes(value: Any, schema: Schema, place: str, tables: Mapping[str, Table]) -> Iterator[InputError]:
+    """Yield an error for each place where a value does not fit its schema. place: of the value in the file, such as "meshes[0].file"."""
+    if "$ref" in schema:
+        schema = tables[schema["$ref"].rsplit("/", 1)[-1]]
+    choices = schema.get("anyOf") or [schema]
+    fitting = [each for each in choices if _has_type(value, _type(each))]
+    if not fitting:
+        yield _wrong(value, " or ".join(TYPES[_type(each)][0] for each in choices), place)
+    elif fitting[0] is not schema and "anyOf" in schema:
+        yield from mistakes(value, fitting[0], place, tables)
+    elif "discriminator" in schema:
+        yield from _in_one_of(value, schema, place, tables)
+    elif isinstance(value, dict):
+        yield from _in_table(value, schema, place, tables)
+    elif isinstance(value, list):
+        least, most = schema.get("minItems", 0), schema.get("maxItems", math.inf)
+        if not least <= len(value) <= most:
+            yield _wrong(value, f"{least} values" if least == most else f"at least {least} values", place)
+            return
+        for i, each in enumerate(value):
+            yield from mistakes(each, schema["items"], f"{place}[{i}]", tables)
+    elif isinstance(value, str):
+        if value not in schema.get("enum", [value]):
+            yield unknown(value, "value", schema["enum"], place=place)
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield _wrong(value, "a finite number", place)
+    elif not isinstance(value, bool):
+        yield from (_wrong(value, f"a number {LIMITS[name][0]} {schema[name]:.15g}", place)
+                    for name in LIMITS if name in schema and _beyond(value, name, schema[name]))
+
+
+def _in_table(value: JsonObject, schema: Schema, place: str, tables: Mapping[str, Table]) -> Iterator[InputError]:
+    found: list[InputError] = []
+    for name, each in value.items():
+        inside = schema["additionalProperties"] or schema["properties"].get(name)
+        if inside is None:
+            found.append(unknown(name, "key", schema["properties"], place=_join(place, name)))
+        else:
+            found += mistakes(each, inside, _join(place, name), tables)
+    found += [InputError("is missing", place=_join(place, name)) for name in schema.get("required", ()) if name not in value]
+    yield from found
+    if isinstance(schema, Table) and not found and (text := schema.rule(value)):
+        yield InputError(text, place=place or "file")
+
+
+def _in_one_of(value: JsonObject, schema: Schema, place: str, tables: Mapping[str, Table]) -> Iterator[InputError]:
+    key, names = schema["discriminator"]["propertyName"], schema["discriminator"]["mapping"]
+    defaults = [kind for kind, each in names.items() if key not in tables[each.rsplit("/", 1)[-1]]["required"]]
+    kind = value.get(key, *defaults)
+    if key not in value and not defaults:
+        yield InputError("is missing", place=_join(place, key))
+    elif kind not in list(names):
+        yield unknown(kind if isinstance(kind, str) else short(kind), key, names, place=_join(place, key))
+    else:
+        yield from mistakes(value, {"$ref": names[kind]}, place, tables)
+
+
 def unknown_materials(data: JsonObject, known: Collection[str]) -> list[InputError]:
-    """Return an error for each reference to an unknown material. The schema reports values of a wrong type."""
+    """Return an error for each reference to an unknown material. `mistakes` reports values of a wrong type."""
     found: list[tuple[str, Any]] = []
     for kind in ("spheres", "quads", "boxes", "meshes"):
         for i, table in enumerate(_tables(data.get(kind))):
@@ -82,52 +125,30 @@ def unknown_materials(data: JsonObject, known: Collection[str]) -> list[InputErr
     return [unknown(name, "material", known, place=place) for place, name in found if isinstance(name, str) and name not in known]
 
 
-def _tables(value: Any) -> list[dict[str, Any]]:
+def _tables(value: Any) -> list[JsonObject]:
     return [table if isinstance(table, dict) else {} for table in value] if isinstance(value, list) else []
 
 
-def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> InputError:
-    kind, context = error["type"], error.get("ctx", {})
-    place, parent = _place(error["loc"], data, kind == "missing")
-    if kind == "extra_forbidden":
-        return unknown(str(error["loc"][-1]), "key", known_keys.get(id(parent), []), place=place)
-    if kind == "missing":
-        return InputError("is missing", place=place)
-    if kind == "value_error":
-        return InputError(str(context["error"]), place=place or "file")
-    if kind in ("union_tag_invalid", "union_tag_not_found"):
-        tag = "type" if context["discriminator"].endswith("()") else context["discriminator"].strip("'")
-        if kind == "union_tag_not_found":
-            return InputError("is missing", place=f"{place}.{tag}")
-        choices = [name.strip("'") for name in context["expected_tags"].split(", ")]
-        return unknown(_text(context["tag"]), tag, choices, place=f"{place}.{tag}")
-    if kind == "literal_error":
-        choices = re.findall("'([^']*)'", context["expected"])
-        return unknown(_text(error["input"]), "value", choices, place=place)
-    expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
-    value = error["input"]
-    return InputError(f"got {str(value).lower() if isinstance(value, bool) else short(value)}, expected {expected}", place=place)
+def _type(schema: Schema) -> str:
+    return str(schema.get("type", "object"))  # references and choices are of tables
 
 
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else short(value)
+def _has_type(value: object, name: str) -> bool:
+    return isinstance(value, TYPES[name][1]) and (name == "boolean" or not isinstance(value, bool))
 
 
-def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
-    """Return the place of a mistake in the file, such as "meshes[0].file", and the table that holds its last key.
-
-    pydantic's `location` also names members of unions. The place leaves out parts that are no keys of the file, but keeps a missing key."""
-    place, parent = "", data
-    for i, part in enumerate(location):
-        if isinstance(part, str) and isinstance(data, dict) and (part in data or (missing and i == len(location) - 1)):
-            parent, data = data, data.get(part)
-            place += f".{_key(part)}" if place else _key(part)
-        elif isinstance(part, int) and isinstance(data, list) and part < len(data):
-            parent, data = data, data[part]
-            place += f"[{part}]"
-    return place, parent
+def _beyond(value: float, name: str, limit: float) -> bool:
+    """Return whether a number is beyond a limit by more than a rounding to float32: 90.0000025 degrees are pi / 2 in float32."""
+    near = isinstance(value, float) and "exclusive" not in name and abs(value - limit) <= ROUNDING * abs(limit)
+    return LIMITS[name][1](value, limit) and not near
 
 
-def _key(name: str) -> str:
-    """Return a key as TOML writes it, in quotes if necessary."""
-    return name if name and name.replace("_", "").replace("-", "").isalnum() and name.isascii() else f'"{name}"'
+def _wrong(value: object, expected: str, place: str) -> InputError:
+    shown = str(value).lower() if isinstance(value, bool) else short(value)
+    return InputError(f"got {shown}, expected {expected}", place=place or "file")
+
+
+def _join(place: str, key: str) -> str:
+    """Return the place of a key of a table, with the key as TOML writes it: in quotes if necessary."""
+    plain = key.replace("_", "").replace("-", "").isalnum() and key.isascii()
+    return ".".join(filter(None, [place, key if plain else f'"{key}"']))

@@ -1,6 +1,5 @@
 """Writing of a scene as a TOML scene file, with its meshes, textures and images in a folder beside it."""
 
-import contextlib
 import io
 import json
 import math
@@ -20,7 +19,7 @@ from wrt.core.packages import needed_by
 from wrt.picture.image import write_image
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS, CameraKind
-from wrt.scene.kinds import FORMS, forms
+from wrt.scene.kinds import forms
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.mesh import Mesh
@@ -28,7 +27,6 @@ from wrt.scene.model import Object, Scene
 
 T = TypeVar("T")
 Table = dict[str, Any]
-TRIES = 4096  # multiples of vectors among which one is normalised to given bits; about 1 in 10 is
 
 
 def write_toml(scene: Scene, path: Path) -> None:
@@ -42,25 +40,15 @@ def write_toml(scene: Scene, path: Path) -> None:
         name = error.object[max(error.start - 20, 0):error.end]
         raise InputError(f"a scene file does not hold a name that is not UTF-8, here {name!r}", path=path) from None
     check_writable(path)
-    folder, made = path.parent / writer.folder, []
-    is_new = bool(writer.files) and not folder.exists()
-    try:
-        if is_new:
-            folder.mkdir()
-        for name, write in writer.files.items():
-            if not (folder / name).exists():
-                made.append(folder / name)
-            write(folder / name)
-        write_bytes(path, data)
-    except BaseException as error:
-        for each in made:
-            each.unlink(missing_ok=True)
-        if is_new:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-        if isinstance(error, OSError):
+    folder = path.parent / writer.folder
+    if writer.files:
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
             raise InputError(f"cannot be written: {error.strerror or error}", path=folder) from error
-        raise
+    for name, write in writer.files.items():
+        write(folder / name)
+    write_bytes(path, data)
 
 
 class _Writer:
@@ -107,12 +95,8 @@ class _Writer:
             value, form = getattr(thing, name), each.metadata["form"]
             if form == "image":
                 out["file"] = self.file("image", ".exr", value, [value], partial(_write_exr, image=value))
-            elif form == "angle":
-                out[name] = _degrees(value, at + name)
-            elif form == "direction":
-                out[name] = _unnormalised(value, at + name)
             elif value is not None:
-                out[name] = value
+                out[name] = math.degrees(value) if form == "angle" else value
         return out
 
     def file(self, stem: str, suffix: str, thing: object, arrays: list[np.ndarray | None], write: Callable[[Path], None]) -> str:
@@ -197,23 +181,6 @@ def _by_unique_name(things: tuple[T, ...], noun: str) -> dict[str, T]:
             name += "_"
         out[name] = thing
     return out
-
-
-def _unnormalised(direction: tuple[float, ...], what: str) -> list[float]:
-    """Return a vector that is normalised to the bits of a unit vector."""
-    rng, unit = np.random.default_rng(0), np.array(direction)
-    for i in range(TRIES):
-        vector: list[float] = (unit * (rng.uniform(1.0, 2.0) if i else 1.0)).tolist()
-        if FORMS["direction"](vector, what, {}) == direction:
-            return vector
-    raise InputError("a scene file does not hold the bits of this direction", place=what)
-
-
-def _degrees(angle: float, what: str) -> float:
-    """Return the degrees of an angle in radians. One in ten angles differs in the last bit of float64; the device has float32."""
-    degrees = math.degrees(angle)
-    near = [degrees, math.nextafter(degrees, math.inf), math.nextafter(degrees, -math.inf)]
-    return min(near, key=lambda each: abs(math.radians(each) - angle))
 
 
 def _write_exr(path: Path, image: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""docs/scene_format.md, the reference of scene files, made from the schema that checks them: `wrt schema --markdown`."""
+"""Make docs/scene_format.md, the reference of scene files, from the schema that checks them: python docs/site/scene_format.py."""
 
 import json
 import re
@@ -16,7 +16,7 @@ HEAD = """\
 # Scene files
 
 A scene is a [TOML](https://toml.io) file. `python -m wrt validate scene.toml` reports every mistake with its place. `python -m wrt schema`
-prints the JSON Schema for editors, and this page with `--markdown`.
+prints the JSON Schema for editors.
 
 - [Concepts](concepts.md#spaces-and-units) describes spaces and units. Angles are in degrees here, and in radians in Python.
 - Matrices are 16 numbers, row by row, and act on column vectors. One number for a colour is a grey.
@@ -25,7 +25,7 @@ prints the JSON Schema for editors, and this page with `--markdown`.
 
 ## Example
 """
-EXAMPLE = Path(__file__).with_name("example.toml").read_text(encoding="utf-8")
+EXAMPLE = Path(__file__).with_name("scene_example.toml").read_text(encoding="utf-8")
 
 
 def scene_format() -> str:
@@ -54,8 +54,9 @@ def _title(name: str) -> str:
 def _described_before(tables: dict[str, Schema], name: str, before: list[str]) -> tuple[list[str], str]:
     """Return the keys that an earlier table describes in the same words, if they are SHARED_KEYS or more, and that table's name."""
     for each in before:
-        there = tables[each]["properties"]
-        if len(known := [key for key, value in tables[name]["properties"].items() if there.get(key) == value]) >= SHARED_KEYS:
+        there, extra = tables[each]["properties"], {*tables[each]["required"]} ^ {*tables[name]["required"]}
+        known = [key for key, value in tables[name]["properties"].items() if there.get(key) == value and key not in extra]
+        if len(known) >= SHARED_KEYS:
             return known, each
     return [], ""
 
@@ -161,3 +162,7 @@ def _limits(value: Schema) -> str:
 
 def _number(text: str) -> str:
     return format(float(text), ".15g")
+
+
+if __name__ == "__main__":
+    (Path(__file__).parents[1] / "scene_format.md").write_text(scene_format(), encoding="utf-8")
