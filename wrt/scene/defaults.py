@@ -3,19 +3,18 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from wrt.core.checks import as_choice, as_one, listed
-from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import MATERIALS, Material
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import quad
 from wrt.scene.size import require_size
-from wrt.scene.studio import studio
 from wrt.scene.values import BLACK, LUMINANCE, SMALLEST, as_number
 
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # Direction from the scene to the camera; the front of glTF is +z, up is +y.
@@ -32,6 +31,30 @@ FILL_REACH = 0.3  # Radius within which surfaces occlude the fill light, in radi
 MATTE = 0.4  # A surface this rough shows no soft boxes, and reflects a pale sky with less noise.
 UP = {"x": np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "y": np.eye(4),
       "z": np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])}  # rotations that turn an axis to +y
+
+
+STUDIO_SIZE = (512, 256)  # pixels of the studio's picture
+EDGE = 0.03  # width of a soft box's blurred edge, as a tangent
+
+
+class SoftBox(NamedTuple):
+    """A rectangle of light. toward: its direction for a camera that looks along -z; width, height: half of each, as tangents."""
+
+    toward: tuple[float, float, float]
+    width: float
+    height: float
+    radiance: float
+
+
+BOXES = (
+    SoftBox((0.75, 0.95, 0.85), 0.42, 0.42, 2.2),  # key, above the camera's right shoulder
+    SoftBox((-1.0, 0.30, 0.35), 0.24, 0.65, 1.2),  # fill, a strip on the left
+    SoftBox((0.45, 0.75, -1.00), 0.60, 0.16, 2.2),  # rim, behind the subject and above the picture
+    SoftBox((-0.25, 1.0, 0.0), 0.50, 0.35, 1.0),  # overhead
+)
+# Radiance of the room from straight below to straight above, by the sine of the elevation.
+ELEVATIONS = (-1.0, -0.6, -0.05, 0.15, 1.0)
+ROOM = (0.10, 0.20, 0.42, 0.40, 0.16)
 
 
 @dataclass(frozen=True)
@@ -228,6 +251,26 @@ def put_on_floor(scene: Scene) -> Scene:
     mesh, grey = quad(corner, (2.0 * side, 0.0, 0.0), (0.0, 0.0, -2.0 * side)), Material(name="floor", albedo=(0.5,) * 3)
     floor = Object(mesh, (grey,), name="floor")
     return replace(scene, cameras=scene.cameras or (frame_camera(scene),), objects=(*scene.objects, floor))
+
+
+def studio(rotation: float = 0.0) -> EnvironmentBackground:
+    """Return soft boxes in a grey room, for metals and glass to reflect.
+
+    The studio is for a camera that looks along -z, turned by `rotation` (radians) about +y, counter-clockwise seen from above."""
+    width, height = STUDIO_SIZE
+    theta = np.pi * (np.arange(height) + 0.5)[:, None] / height
+    phi = 2.0 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    ray = np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)), axis=-1)
+    radiance = np.interp(ray[..., 1], ELEVATIONS, ROOM)
+    for box in BOXES:
+        back = np.array(box.toward) / np.linalg.norm(box.toward)
+        side = np.cross((0.0, 1.0, 0.0) if abs(back[1]) < 0.9 else (0.0, 0.0, 1.0), back)
+        side /= np.linalg.norm(side)
+        along = np.maximum(ray @ back, 1e-9)
+        inside = [np.clip((half - np.abs(ray @ axis) / along) / EDGE + 0.5, 0.0, 1.0)
+                  for axis, half in ((side, box.width), (np.cross(back, side), box.height))]
+        radiance = np.maximum(radiance, box.radiance * inside[0] * inside[1])
+    return EnvironmentBackground(np.repeat(radiance[..., None], 3, axis=-1), rotation=rotation, name="studio")
 
 
 def stage(scene: Scene, staging: Staging | None = None) -> tuple[Scene, list[str]]:

@@ -38,11 +38,10 @@ from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material, Texture
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, smooth
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import icosphere, quad
-from wrt.scene.vertex_normals import smooth
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 SIZE = (160, 120)

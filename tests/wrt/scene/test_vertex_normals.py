@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, smooth
 from wrt.scene.shapes import box, icosphere, torus
-from wrt.scene.vertex_normals import smooth
 
 
 def test_close_to_the_normals_of_the_surface() -> None:

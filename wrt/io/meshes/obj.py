@@ -21,8 +21,8 @@ from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 from wrt.io.text import as_number, without_comment
+from wrt.scene.mesh import corner_normals
 from wrt.scene.values import near_zero
-from wrt.scene.vertex_normals import corner_normals
 
 # Keywords of the parts of a corner `v/vt/vn`, with the count of numbers that wrt reads from a line with that keyword.
 _WIDTHS = {"v": 3, "vt": 2, "vn": 3}

@@ -16,10 +16,9 @@ from wrt.core.types import JsonObject
 from wrt.io.mesh_file import load_mesh
 from wrt.scene import shapes
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, smooth
 from wrt.scene.model import Object
 from wrt.scene.motion import Motion
-from wrt.scene.vertex_normals import smooth
 
 STILL = {"translate": (0.0, 0.0, 0.0), "rotate": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
 

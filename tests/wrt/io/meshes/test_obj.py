@@ -11,8 +11,8 @@ from tests.refused import refused
 from wrt.core.errors import SceneWarning
 from wrt.io.mesh_file import load_mesh
 from wrt.io.meshes.obj import read as read_obj
+from wrt.scene.mesh import smooth
 from wrt.scene.shapes import icosphere
-from wrt.scene.vertex_normals import smooth
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
