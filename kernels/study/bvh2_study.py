@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces, size_of
-from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, Child, box_volumes, child_of, make_binary_traversal, make_struct
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node, Child, box_volumes, child_of, make_binary_traversal, make_struct, step_count
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.observer import make_observer
+from wrt.kernels.traverse.steps import ENTERED
 
 LEVELS = 62  # largest number of levels of a tree for which a trail has bits
 TOP = wp.constant(wp.uint64(1 << 63))
@@ -63,7 +64,7 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test
-    fetch_node, _, push, finish = make_counters(units, size_of(Bvh2Node))
+    observe = make_observer(units, size_of(Bvh2Node))
     struct = make_struct(units.triangle_test.record)
     capacity = max(entries, 1)
 
@@ -71,7 +72,6 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
         stack = wp.zeros(shape=wp.static(capacity), dtype=Child)
         stack_t = wp.zeros(shape=wp.static(capacity), dtype=wp.float32)
         top = int(0)  # number of pushes minus number of pops; the newest entry has the index (top - 1) modulo capacity
@@ -81,14 +81,13 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
         trail.level = TOP
         while trail.done < TOP:
             if child.count > 0:
-                counts.leaves += 1
-                best, counts = visit_leaf(accel, surfaces, probe, child.first, child.count, best, counts)
+                best = visit_leaf(accel, surfaces, probe, child.first, child.count, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
             else:
                 node = accel.nodes[child.first]
-                counts = fetch_node(accel.recorder, ray, counts, child.first, 2)
+                observe.node(accel.recorder, ray, child.first, 2, 1)
                 t_0 = ray_aabb(probe.box, node.lo_0, node.hi_0, best.t)
                 t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
                 if t_0 < wp.inf or t_1 < wp.inf:
@@ -99,11 +98,12 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                         if (trail.done & trail.level) != NONE:
                             second = not second
                         elif wp.static(entries > 0):
-                            stack[top % wp.static(capacity)] = child_of(node, not second)
+                            far = child_of(node, not second)
+                            stack[top % wp.static(capacity)] = far
                             stack_t[top % wp.static(capacity)] = wp.where(second, t_0, t_1)
                             top = top + 1
                             size = wp.min(size + 1, wp.static(capacity))
-                            counts = push(counts, size)
+                            observe.push(accel.recorder, ray, far.first, step_count(far.count), wp.where(second, t_0, t_1), size - 1, size)
                     elif trail.level != trail.resumed:
                         trail.done = trail.done | trail.level
                     else:
@@ -119,13 +119,14 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                 if size > 0 and trail.done < TOP:
                     size = size - 1
                     top = top - 1
-                    counts.pops += 1
                     trail.level = trail.resumed
-                    found = stack_t[top % wp.static(capacity)] <= best.t
+                    t = stack_t[top % wp.static(capacity)]
+                    found = t <= best.t
                     child = stack[top % wp.static(capacity)]
+                    observe.pop(accel.recorder, ray, child.first, step_count(child.count), t, wp.where(found, ENTERED, 0))
                 else:
                     trail.level = TOP
                     found = True
-        return finish(accel.recorder, ray, counts, best)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

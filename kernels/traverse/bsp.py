@@ -35,9 +35,8 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.bvh2 import Child, child_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
-from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.observer import Recorder, make_observer, write_step
 from wrt.kernels.traverse.steps import ENTERED, cell_step, part_step, plane_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
@@ -171,15 +170,13 @@ def record_sides(recorder: Recorder, ray: Ray, index: int, node: BspNode, sides:
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, reach) -> (best Hit, Counts), which visits the cells along the ray's part `reach`."""
+    """Make walk(accel, surfaces, probe, reach) -> best Hit, which visits the cells along the ray's part `reach`."""
     visit_leaf = make_leaf(units, any_hit, accepts)
-    fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
-    record_push, record_pop = make_recording(units)
+    observe = make_observer(units, size_of(BspNode))
 
     @wp.func
-    def walk(accel: Any, surfaces: Any, probe: Probe, reach: Reach):
+    def walk(accel: Any, surfaces: Any, probe: Probe, reach: Reach) -> Hit:
         best = no_hit(probe.ray)
-        counts = Counts()
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_part = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.vec2)
@@ -190,24 +187,22 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
         found = part[0] <= part[1]
         while found:
             if count >= 0:
-                counts.leaves += wp.where(count > 0, 1, 0)
-                best, counts = visit_leaf(accel, surfaces, probe, first, count, best, counts)
+                best = visit_leaf(accel, surfaces, probe, first, count, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
             else:
-                counts = fetch_node(accel.recorder, probe.ray, counts, first, 0)
+                observe.node(accel.recorder, probe.ray, first, 0, 1)
                 sides = cut_by_plane(accel.nodes[first], probe.box, probe.ray.direction, part, reach.drift)
-                if wp.static(units.steps):
+                if wp.static(units.observer == "log"):
                     record_sides(accel.recorder, probe.ray, first, accel.nodes[first], sides, part)
                 if sides.meets_near:
                     if sides.meets_far:
                         stack_first[size] = sides.far.first
                         stack_count[size] = sides.far.count
                         stack_part[size] = wp.vec2(sides.far_t_0, part[1])
-                        record_push(accel.recorder, probe.ray, sides.far.first, sides.far.count, sides.far_t_0, size)
                         size = size + 1
-                        counts = push(counts, size)
+                        observe.push(accel.recorder, probe.ray, sides.far.first, sides.far.count, sides.far_t_0, size - 1, size)
                     first = sides.near.first
                     count = sides.near.count
                     part = wp.vec2(part[0], sides.near_t_1)
@@ -221,13 +216,12 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                counts.pops += 1
                 first = stack_first[size]
                 count = stack_count[size]
                 part = wp.vec2(stack_part[size][0], wp.min(stack_part[size][1], best.t + reach.beyond))
                 found = part[0] <= best.t + reach.beyond
-                record_pop(accel.recorder, probe.ray, first, count, part[0], wp.where(found, ENTERED, 0))
-        return best, counts
+                observe.pop(accel.recorder, probe.ray, first, count, part[0], wp.where(found, ENTERED, 0))
+        return best
 
     return walk
 
@@ -236,16 +230,15 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
-    _, _, _, finish = make_counters(units, 0)
+    observe = make_observer(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         reach = reach_of(probe.box, ray, no_hit(ray).t, accel.lo, accel.hi, accel.extent)
-        if wp.static(units.steps):
-            write_step(accel.recorder, ray.slot, cell_step(accel.first, accel.count, accel.lo, accel.hi, reach.t_0, reach.t_1))
-        best, counts = walk(accel, surfaces, probe, reach)
-        return finish(accel.recorder, ray, counts, best)
+        observe.step(accel.recorder, ray, cell_step(accel.first, accel.count, accel.lo, accel.hi, reach.t_0, reach.t_1))
+        best = walk(accel, surfaces, probe, reach)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

@@ -10,9 +10,8 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
-from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.observer import Recorder, make_observer
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.traverse.steps import ENTERED, INNER, Step, box_step
 from wrt.kernels.units.box import BoxRay
@@ -105,14 +104,14 @@ def step_count(count: int) -> int:
     return wp.where(count > 0, count, INNER)
 
 
-def make_recorded(units: Units, volumes: Volumes) -> Any:
-    """Make record_children, for the tests of a node's children, and record_popped (kernels.traverse.steps)."""
-    outline = volumes.outline
-    _, record_pop = make_recording(units)
+def make_observe_node(units: Units, volumes: Volumes) -> Any:
+    """Make observe_node(recorder, ray, index, node, entry): node `index` is fetched, and the volumes of its children are tested."""
+    outline, observe = volumes.outline, make_observer(units, size_of(volumes.node))
 
     @wp.func
-    def record_children(recorder: Recorder, ray: Ray, node: Any, entry: wp.vec2):
-        if wp.static(units.steps):
+    def observe_node(recorder: Recorder, ray: Ray, index: int, node: Any, entry: wp.vec2):
+        observe.node(recorder, ray, index, 2, 1)
+        if wp.static(units.observer == "log"):
             for k in range(2):
                 child = child_of(node, k == 1)
                 step = outline(node, k == 1)
@@ -120,14 +119,9 @@ def make_recorded(units: Units, volumes: Volumes) -> Any:
                 step.count = step_count(child.count)
                 step.result = wp.where(entry[k] < wp.inf, ENTERED, 0)
                 step.t = entry[k]
-                write_step(recorder, ray.slot, step)
+                observe.step(recorder, ray, step)
 
-    @wp.func
-    def record_popped(recorder: Recorder, ray: Ray, key: wp.uint64, count: int, end: float):
-        if wp.static(units.steps):
-            record_pop(recorder, ray, reference_of(key), step_count(count), t_of(key), wp.where(t_of(key) <= end, ENTERED, 0))
-
-    return record_children, record_popped
+    return observe_node
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
@@ -143,9 +137,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
     nearer child first. early: drop nodes that begin behind the best hit."""
     probe_of = make_probe(units)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
-    fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))
-    record_children, record_popped = make_recorded(units, volumes)
-    record_push, _ = make_recording(units)
+    observe, observe_node = make_observer(units, 0), make_observe_node(units, volumes)
     # A stack entry is a key (entry distance, and inner node or first primitive) and the child's `count`.
     new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
@@ -156,7 +148,6 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
         prepared = set_up(accel, probe)
         best = no_hit(ray)
         end = best.t
-        counts = Counts()
         keys = new_keys()
         first_keys = shared_keys()
         sizes = new_counts()
@@ -168,8 +159,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
         count = int(0)
         while True:
             if count > 0:
-                counts.leaves += 1
-                best, counts = visit_leaf(accel, surfaces, probe, first, count, best, counts)
+                best = visit_leaf(accel, surfaces, probe, first, count, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
@@ -177,9 +167,8 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                     end = best.t
             else:
                 node = accel.nodes[first]
-                counts = fetch_node(accel.recorder, ray, counts, first, 2)
                 entry = enter(prepared, node, end)
-                record_children(accel.recorder, ray, node, entry)
+                observe_node(accel.recorder, ray, first, node, entry)
                 hit_0 = entry[0] < wp.inf
                 hit_1 = entry[1] < wp.inf
                 if hit_0 or hit_1:
@@ -188,11 +177,11 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                         second = (choose(entry) and hit_1) or not hit_0
                     if hit_0 and hit_1:
                         far = child_of(node, not second)
-                        put_key(keys, first_keys, size, key_of(wp.where(second, entry[0], entry[1]), far.first))
+                        t = wp.where(second, entry[0], entry[1])
+                        put_key(keys, first_keys, size, key_of(t, far.first))
                         put_count(sizes, first_sizes, size, far.count)
-                        record_push(accel.recorder, ray, far.first, step_count(far.count), wp.where(second, entry[0], entry[1]), size)
                         size = size + 1
-                        counts = push(counts, size)
+                        observe.push(accel.recorder, ray, far.first, step_count(far.count), t, size - 1, size)
                     near = child_of(node, second)
                     first = near.first
                     count = near.count
@@ -201,15 +190,13 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                counts.pops += 1
                 key = key_at(keys, first_keys, size)
-                record_popped(accel.recorder, ray, key, count_at(sizes, first_sizes, size), end)
-                if t_of(key) <= end:
-                    first = reference_of(key)
-                    count = count_at(sizes, first_sizes, size)
-                    found = True
+                found = t_of(key) <= end
+                first = reference_of(key)
+                count = count_at(sizes, first_sizes, size)
+                observe.pop(accel.recorder, ray, first, step_count(count), t_of(key), wp.where(found, ENTERED, 0))
             if not found:
                 break
-        return finish(accel.recorder, ray, counts, best)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

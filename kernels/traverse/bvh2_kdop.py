@@ -7,8 +7,8 @@ import warp as wp
 
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
 from wrt.kernels.traverse.common import Probe, Units
-from wrt.kernels.traverse.counters import Recorder
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.observer import Recorder
 from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 

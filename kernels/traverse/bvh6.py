@@ -10,9 +10,8 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
-from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.observer import Recorder, make_observer
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.traverse.steps import ENTERED, INNER, box_step
 
@@ -67,32 +66,21 @@ def reference(node: Bvh6Node, slot: int) -> int:
     return wp.where(slot < inner, node.node + slot, -1 - (node.primitive + slot - inner))
 
 
-def make_recorded(units: Units) -> Any:
-    """Make record_box, record_push and record_pop (kernels.traverse.steps)."""
-    record_pushed, record_popped = make_recording(units)
-
-    @wp.func
-    def record_box(recorder: Recorder, ray: Ray, child: int, lo: wp.vec3, hi: wp.vec3, t: float):
-        if wp.static(units.steps):
-            write_step(recorder, ray.slot, box_step(wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), lo, hi, t))
-
-    @wp.func
-    def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
-        child = reference_of(key)
-        record_pushed(recorder, ray, wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), t_of(key), below)
-
-    @wp.func
-    def record_pop(recorder: Recorder, ray: Ray, key: wp.uint64, end: float):
-        child = reference_of(key)
-        taken = wp.where(t_of(key) <= end, ENTERED, 0)
-        record_popped(recorder, ray, wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), t_of(key), taken)
-
-    return record_box, record_push, record_pop
+@wp.func
+def index_of(child: int) -> int:
+    """Return the index of a child's node, or of its leaf's primitive."""
+    return wp.max(child, -1 - child)
 
 
-def make_enter_children(units: Units, record_box: Any) -> Any:
+@wp.func
+def count_of(child: int) -> int:
+    """Return Step.count of a child."""
+    return wp.where(child < 0, 1, INNER)
+
+
+def make_enter_children(units: Units) -> Any:
     """Make enter_children(recorder, probe, node, children, t_max) -> (Entries, n): keys of the n entered children, the nearest last."""
-    ray_aabb = units.box_test
+    ray_aabb, observe = units.box_test, make_observer(units, 0)
 
     @wp.func
     def enter_children(recorder: Recorder, probe: Probe, node: Bvh6Node, children: int, t_max: float):
@@ -102,9 +90,10 @@ def make_enter_children(units: Units, record_box: Any) -> Any:
             lo = wp.vec3(plane(node, 0, slot), plane(node, 2, slot), plane(node, 4, slot))
             hi = wp.vec3(plane(node, 1, slot), plane(node, 3, slot), plane(node, 5, slot))
             t = ray_aabb(probe.box, lo, hi, t_max)
-            record_box(recorder, probe.ray, reference(node, slot), lo, hi, t)
+            child = reference(node, slot)
+            observe.step(recorder, probe.ray, box_step(index_of(child), count_of(child), lo, hi, t))
             if t < wp.inf:
-                key = key_of(t + 0.0, reference(node, slot))  # t + 0.0: never -0
+                key = key_of(t + 0.0, child)  # t + 0.0: never -0
                 j = int(n)
                 while j > 0 and entered[j - 1] < key:
                     entered[j] = entered[j - 1]
@@ -121,52 +110,46 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     struct = make_struct(units.triangle_test.record)
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
-    fetch_node, _, push, finish = make_counters(units, size_of(Bvh6Node))
-    record_box, record_push, record_pop = make_recorded(units)
-    enter_children = make_enter_children(units, record_box)
+    observe, enter_children = make_observer(units, size_of(Bvh6Node)), make_enter_children(units)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
         stack = new_stack()
         shared = shared_stack()
         size = int(0)
         current = int(0)
         while True:
             if current < 0:
-                counts.leaves += 1
-                best, counts = visit_leaf(accel, surfaces, probe, -1 - current, 1, best, counts)
+                best = visit_leaf(accel, surfaces, probe, -1 - current, 1, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
             else:
                 node = accel.nodes[current]
                 children = (node.counts & wp.static((1 << LEAVES_SHIFT) - 1)) + (node.counts >> LEAVES_SHIFT)
-                counts = fetch_node(accel.recorder, ray, counts, current, children)
+                observe.node(accel.recorder, ray, current, children, 1)
                 entered, n = enter_children(accel.recorder, probe, node, children, best.t)
                 if n > 0:
                     for j in range(n - 1):
-                        record_push(accel.recorder, ray, entered[j], size)
                         put(stack, shared, size, entered[j])
+                        child = reference_of(entered[j])
                         size = size + 1
-                        counts = push(counts, size)
+                        observe.push(accel.recorder, ray, index_of(child), count_of(child), t_of(entered[j]), size - 1, size)
                     current = reference_of(entered[n - 1])
                     continue
             # Pop the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                counts.pops += 1
                 key = get(stack, shared, size)
-                record_pop(accel.recorder, ray, key, best.t)
-                if t_of(key) <= best.t:
-                    current = reference_of(key)
-                    found = True
+                found = t_of(key) <= best.t
+                current = reference_of(key)
+                observe.pop(accel.recorder, ray, index_of(current), count_of(current), t_of(key), wp.where(found, ENTERED, 0))
             if not found:
                 break
-        return finish(accel.recorder, ray, counts, best)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

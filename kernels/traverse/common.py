@@ -16,10 +16,9 @@ class Units(NamedTuple):
     triangle: str = "watertight"  # Name of the triangle test in RAY_TRIANGLE.
     box: str = "conservative"  # Name of the box test in RAY_AABB.
     spheres: bool = False  # True if primitives may be spheres.
-    counters: bool = False  # True to count fetches and tests (kernels.traverse.counters).
+    observer: str = ""  # How a walk is observed (kernels.traverse.observer): "" (not at all), "sum", or "log".
     instances: bool = False  # True if the structure is placed by instances: Ray.first_prim is added to each prim_id.
     resumes: bool = False  # True to resume behind a hit: a hit at t_min counts only if prim_id >= Ray.slot. No spheres.
-    steps: bool = False  # True to record each step (kernels.traverse.steps), with `counters`; not with `instances`.
     lists: bool = False  # True to list all hits (kernels.hit_lists) instead of the best hit.
     stack: str = "local"  # Name in kernels.traverse.stack.PLACES: where the stack is, in the structures that support the choice.
 

@@ -11,8 +11,8 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
+from wrt.kernels.traverse.observer import Recorder, make_observer
 from wrt.kernels.traverse.steps import INNER, cell_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
@@ -125,44 +125,43 @@ def layout_of(accel: Any) -> GridLayout:
     return layout
 
 
-def make_record_cell(units: Units) -> Any:
-    """Make record_cell(recorder, ray, layout, index, t, t_end), for cell `index` or, if index = INNER, the whole grid."""
+def make_observe_cell(units: Units) -> Any:
+    """Make observe_cell(recorder, ray, layout, index, t, t_end): the ray is in cell `index` from t to t_end."""
+    observe = make_observer(units, size_of(GridCell))
 
     @wp.func
-    def record_cell(recorder: Recorder, ray: Ray, layout: GridLayout, index: int, t: float, t_end: float):
-        if wp.static(units.steps):
-            lo = layout.lo
-            hi = layout.hi
-            if index != INNER:
-                cell = wp.vec3i(index % layout.n[0], (index / layout.n[0]) % layout.n[1], index / (layout.n[0] * layout.n[1]))
-                for axis in range(3):
-                    lo[axis] = grid_plane(layout, axis, cell[axis])
-                    hi[axis] = grid_plane(layout, axis, cell[axis] + 1)
-            write_step(recorder, ray.slot, cell_step(index, INNER, lo, hi, t, t_end))
+    def observe_cell(recorder: Recorder, ray: Ray, layout: GridLayout, index: int, t: float, t_end: float):
+        observe.node(recorder, ray, index, 0, 1)
+        if wp.static(units.observer == "log"):
+            cell = wp.vec3i(index % layout.n[0], (index / layout.n[0]) % layout.n[1], index / (layout.n[0] * layout.n[1]))
+            lo = wp.vec3()
+            hi = wp.vec3()
+            for axis in range(3):
+                lo[axis] = grid_plane(layout, axis, cell[axis])
+                hi[axis] = grid_plane(layout, axis, cell[axis] + 1)
+            observe.step(recorder, ray, cell_step(index, INNER, lo, hi, t, t_end))
 
-    return record_cell
+    return observe_cell
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
-    fetch_node, _, _, finish = make_counters(units, size_of(GridCell))
-    record_cell = make_record_cell(units)
+    observe, observe_cell = make_observer(units, 0), make_observe_cell(units)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
         layout = layout_of(accel)
         slack = cell_slack(probe.box, accel.pad, accel.extent)
         interval = slab_interval(probe.box, layout.lo, layout.hi)
         t_in = wp.max(interval[0], earlier(ray.t_min) - slack)
-        record_cell(accel.recorder, ray, layout, INNER, t_in, later(interval[1]))
+        observe.step(accel.recorder, ray, cell_step(INNER, INNER, layout.lo, layout.hi, t_in, later(interval[1])))
         if not (t_in <= later(interval[1]) and t_in < wp.inf):
-            return finish(accel.recorder, ray, counts, best)
+            return observe.finish(accel.recorder, ray, best)
         slab = wp.vec3i()
         step = wp.vec3i()
         t_next = wp.vec3()
@@ -187,19 +186,16 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 index = (corner + (k % (side_slabs + 1)) * step[side] * stride[side]
                          + (k / (side_slabs + 1)) * step[other] * stride[other])
                 cell = accel.cells[index]
-                counts = fetch_node(accel.recorder, ray, counts, index, 0)
-                record_cell(accel.recorder, ray, layout, index, t_in, t_out)
-                if cell.count > 0:
-                    counts.leaves += 1
-                mailbox, best, counts = visit_leaf(accel, surfaces, probe, cell, mailbox, best, counts)
+                observe_cell(accel.recorder, ray, layout, index, t_in, t_out)
+                mailbox, best = visit_leaf(accel, surfaces, probe, cell, mailbox, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
-                        return finish(accel.recorder, ray, counts, best)
+                        return observe.finish(accel.recorder, ray, best)
             slab[axis] = slab[axis] + step[axis]
             if slab[axis] < 0 or slab[axis] >= layout.n[axis]:
                 break
             t_in = t_out
             t_next[axis] = exit_distance(layout, probe.box, axis, slab[axis])
-        return finish(accel.recorder, ray, counts, best)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.bvh2 import Bvh2Node, Volumes, make_binary_traversal
 from wrt.kernels.traverse.common import Probe, Units
-from wrt.kernels.traverse.counters import Counts, Recorder, add_counts
+from wrt.kernels.traverse.observer import Recorder, make_observer
 from wrt.kernels.units.box import BoxRay, ray_aabb
 
 HALF_STEP = wp.constant(wp.float64(2.0**-150))  # Half the distance of the numbers in float32 that are below 2^-126.
@@ -140,6 +140,7 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
 
 def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> Any:
     """Make visit_leaf (kernels.traverse.leaf) for the upper level; bottom: the traversal of the placed structures."""
+    observe = make_observer(units, 0)
 
     @wp.func
     def visit(accel: struct, surfaces: Any, ray: Ray, index: int, best: Hit) -> Hit:
@@ -147,7 +148,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
         With Units.lists, `surfaces` is HitLists, which receives the hits; the result is a miss."""
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
-        if wp.static(units.counters):
+        if wp.static(units.observer != ""):
             structure.recorder = accel.recorder
             structure.recorder.base = accel.bases[place.bottom]
         scale = local_scale(place, ray.direction)
@@ -169,16 +170,14 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
         return hit
 
     @wp.func
-    def visit_leaf(accel: struct, surfaces: Any, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
-        if wp.static(units.counters):  # the lower level adds its own counts to the recorder, so these must be there first
-            add_counts(accel.recorder, probe.ray.slot, counts)
-            counts = Counts()
+    def visit_leaf(accel: struct, surfaces: Any, probe: Probe, first: int, count: int, best: Hit) -> Hit:
+        observe.leaf(accel.recorder, probe.ray, first, count)
         for i in range(first, first + count):
             best = visit(accel, surfaces, probe.ray, i, best)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     break
-        return best, counts
+        return best
 
     return visit_leaf
 

@@ -17,10 +17,9 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.cell_ray import earlier, later
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
-from wrt.kernels.traverse.recording import make_recording
-from wrt.kernels.traverse.steps import ENTERED, INNER, box_step, part_step, plane_step
+from wrt.kernels.traverse.observer import Recorder, make_observer, write_step
+from wrt.kernels.traverse.steps import ENTERED, INNER, part_step, plane_step
 from wrt.kernels.units.box import slab_interval
 
 # Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
@@ -95,13 +94,12 @@ def record_split(recorder: Recorder, ray: Ray, index: int, node: KdNode, t_split
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, root_part, slack, counts) -> (best Hit, Counts). root_part: (t_enter, t_exit) at the root."""
+    """Make walk(accel, surfaces, probe, root_part, slack) -> best Hit. root_part: (t_enter, t_exit) at the root."""
     visit_leaf = make_leaf(units, any_hit, accepts)
-    fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
-    record_push, record_pop = make_recording(units)
+    observe = make_observer(units, size_of(KdNode))
 
     @wp.func
-    def walk(accel: Any, surfaces: Any, probe: Probe, root_part: wp.vec2, slack: float, counts: Counts):
+    def walk(accel: Any, surfaces: Any, probe: Probe, root_part: wp.vec2, slack: float) -> Hit:
         best = no_hit(probe.ray)
         part = wp.vec2(root_part)
         stack_index = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
@@ -111,8 +109,8 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
         found = bool(True)
         while found:
             node = accel.nodes[index]
-            counts = fetch_node(accel.recorder, probe.ray, counts, index, 0)
             axis = node.word & 3
+            observe.node(accel.recorder, probe.ray, index, 0, wp.where(axis != LEAF, 1, 0))  # a leaf has no plane to test
             first = node.word >> 2
             if axis != LEAF:
                 inverse = probe.box.inv_dir[axis]
@@ -120,7 +118,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 far = wp.where(inverse < 0.0, first, first + 1)
                 near_exit = later(t_split)
                 far_enter = wp.where(earlier(t_split) > part[0], earlier(t_split), part[0])
-                if wp.static(units.steps):
+                if wp.static(units.observer == "log"):
                     record_split(accel.recorder, probe.ray, index, node, t_split, part)
                 if part[0] > near_exit:
                     index = far
@@ -129,15 +127,12 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     if not part[1] < earlier(t_split):
                         stack_index[size] = far
                         stack_part[size] = wp.vec2(far_enter, part[1])
-                        record_push(accel.recorder, probe.ray, far, INNER, far_enter, size)
                         size = size + 1
-                        counts = push(counts, size)
+                        observe.push(accel.recorder, probe.ray, far, INNER, far_enter, size - 1, size)
                     index = wp.where(inverse < 0.0, first + 1, first)
                     part = wp.vec2(part[0], wp.where(near_exit < part[1], near_exit, part[1]))
                 continue
-            counts.leaves += 1
-            counts.box_operations -= 1  # a leaf has no plane to test
-            best, counts = visit_leaf(accel, surfaces, probe, first, int(node.split), best, counts)
+            best = visit_leaf(accel, surfaces, probe, first, int(node.split), best)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     break
@@ -146,12 +141,11 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                counts.pops += 1
                 index = stack_index[size]
                 part = wp.vec2(stack_part[size][0], wp.where(limit < stack_part[size][1], limit, stack_part[size][1]))
                 found = part[0] <= part[1]
-                record_pop(accel.recorder, probe.ray, index, INNER, part[0], wp.where(found, ENTERED, 0))
-        return best, counts
+                observe.pop(accel.recorder, probe.ray, index, INNER, part[0], wp.where(found, ENTERED, 0))
+        return best
 
     return walk
 
@@ -161,20 +155,16 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     probe_of = make_probe(units)
     ray_aabb = units.box_test
     walk = make_walk(units, any_hit, accepts)
-    _, _, _, finish = make_counters(units, 0)
+    observe = make_observer(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
-        counts.boxes += 1  # the box of the root's cell
-        counts.box_operations += 1
-        if wp.static(units.steps):
-            enter = ray_aabb(probe.box, accel.lo, accel.hi, best.t)
-            write_step(accel.recorder, ray.slot, box_step(0, INNER, accel.lo, accel.hi, enter))
-        if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
+        enter = ray_aabb(probe.box, accel.lo, accel.hi, best.t)
+        observe.root(accel.recorder, ray, accel.lo, accel.hi, enter)
+        if enter < wp.inf:
             slack = clamp_slack(ray.direction, probe.box.inv_dir, accel.reach)
             limit = limit_of(best.t, slack)
             span = slab_interval(probe.box, accel.lo, accel.hi)
@@ -182,7 +172,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             t_exit = later(span[1]) + slack
             begin = ray.t_min * (2.0 - CLAMP_RELATIVE) - slack
             part = wp.vec2(wp.where(begin > t_enter, begin, t_enter), wp.where(limit < t_exit, limit, t_exit))
-            best, counts = walk(accel, surfaces, probe, part, slack, counts)
-        return finish(accel.recorder, ray, counts, best)
+            best = walk(accel, surfaces, probe, part, slack)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

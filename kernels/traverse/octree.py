@@ -11,9 +11,8 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
-from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.observer import Recorder, make_observer, write_step
 from wrt.kernels.traverse.steps import ENTERED, INNER, STAYS, box_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
@@ -182,7 +181,7 @@ def make_record_octants(units: Units) -> Any:
     @wp.func
     def record_octants(recorder: Recorder, slot: int, ray: OctreeRay, node: OctreeNode, corner: wp.vec3i, size: int, met: int):
         """Record the octants of a node. corner, size: of its cell; met: the mask of `enter_octants`."""
-        if wp.static(units.steps):
+        if wp.static(units.observer == "log"):
             half = size >> 1
             for octant in range(8):
                 if ((-node.count) >> octant) & 1 != 0:
@@ -198,14 +197,13 @@ def make_record_octants(units: Units) -> Any:
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> (best Hit, Counts); set_up: OctreeRay; enter: t at the root's cell."""
+    """Make walk(accel, surfaces, probe, set_up, enter) -> best Hit; set_up: OctreeRay; enter: t at the root's cell."""
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
-    fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
-    record_push, record_pop = make_recording(units)
+    observe = make_observer(units, size_of(OctreeNode))
     record_octants = make_record_octants(units)
 
     @wp.func
-    def walk(accel: Any, surfaces: Any, probe: Probe, set_up: OctreeRay, enter: float, counts: Counts):
+    def walk(accel: Any, surfaces: Any, probe: Probe, set_up: OctreeRay, enter: float) -> Hit:
         best = no_hit(probe.ray)
         mailbox = Mailbox()
         stack_first = wp.zeros(shape=wp.static(MAX_LEVELS), dtype=wp.int32)
@@ -219,10 +217,10 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
         found = bool(True)
         while found:
             node = accel.nodes[index]
-            counts = fetch_node(accel.recorder, probe.ray, counts, index, 0)
             left = int(0)
+            observe.node(accel.recorder, probe.ray, index, wp.where(node.count < 0, wp.bit_count(-node.count), 0),
+                         wp.where(node.count < 0, 1, 0))  # a leaf has no planes
             if node.count < 0:
-                counts.boxes += wp.bit_count(-node.count)
                 left = enter_octants(set_up, -node.count, corner, size, enter, later(best.t) + set_up.slack)
                 record_octants(accel.recorder, probe.ray.slot, set_up, node, corner, size, left)
                 if left != 0:
@@ -231,13 +229,10 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     stack_left[level] = left
                     level += 1
                     if (left & (left - 1)) != 0:
-                        record_push(accel.recorder, probe.ray, index, INNER, enter, entries)
                         entries += 1
-                        counts = push(counts, entries)
+                        observe.push(accel.recorder, probe.ray, index, INNER, enter, entries - 1, entries)
             else:
-                counts.leaves += 1
-                counts.box_operations -= 1  # a leaf has no planes
-                mailbox, best, counts = visit_leaf(accel, surfaces, probe, node, mailbox, best, counts)
+                mailbox, best = visit_leaf(accel, surfaces, probe, node, mailbox, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
@@ -259,11 +254,10 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     found = fresh or enter <= later(best.t) + set_up.slack
                     index = stack_first[level - 1] + wp.bit_count(stack_occupied[level - 1] & ((1 << octant) - 1))
                     if not fresh:
-                        counts.pops += 1
                         entries -= wp.where(left == 0, 1, 0)
-                        record_pop(accel.recorder, probe.ray, index, INNER, enter, int(found) * ENTERED + int(left != 0) * STAYS)
+                        observe.pop(accel.recorder, probe.ray, index, INNER, enter, int(found) * ENTERED + int(left != 0) * STAYS)
                     fresh = False
-        return best, counts
+        return best
 
     return walk
 
@@ -272,24 +266,20 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
-    _, _, _, finish = make_counters(units, 0)
+    observe = make_observer(units, 0)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
-        counts.boxes += 1  # the box of the root's cell
-        counts.box_operations += 1
         set_up = octree_ray(accel, probe.box, ray.t_min)
         interval = slab_interval(probe.box, accel.lo, accel.hi)
         enter = wp.max(interval[0], set_up.begin)
-        if wp.static(units.steps):
-            met = enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf
-            write_step(accel.recorder, ray.slot, box_step(0, INNER, accel.lo, accel.hi, wp.where(met, enter, float(wp.inf))))
-        if enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf:
-            best, counts = walk(accel, surfaces, probe, set_up, enter, counts)
-        return finish(accel.recorder, ray, counts, best)
+        met = enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf
+        observe.root(accel.recorder, ray, accel.lo, accel.hi, wp.where(met, enter, float(wp.inf)))
+        if met:
+            best = walk(accel, surfaces, probe, set_up, enter)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse

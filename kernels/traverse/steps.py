@@ -1,12 +1,10 @@
-"""The steps of a traversal as records: what was fetched, tested, pushed and popped, with the distances and the result.
-They are compiled in only with `Units.steps`. The functions here make one `Step` each; `counters.write_step` stores it.
+"""The steps of a walk as records: what was fetched, tested, pushed and popped, with the distances and the result.
+The functions here make one `Step` each; the observer of a log stores it (kernels.traverse.observer).
 
 A child is given by `index` and `count`, as in bvh2: the inner node `index` with count = INNER, or a leaf with the `count` primitives from
 `index` on. In structures whose leaves are nodes (k-d tree, octree), all children have count = INNER."""
 
 import warp as wp
-
-from wrt.kernels.structs import Hit
 
 KINDS = ("node", "box", "plane", "part", "cell", "leaf", "test", "skip", "push", "pop")
 NODE = wp.constant(0)  # A node is fetched; in a grid, a cell.
@@ -48,7 +46,7 @@ class Step:
 
 
 @wp.func
-def simple_step(kind: int, index: int, count: int) -> Step:
+def make_step(kind: int, index: int, count: int) -> Step:
     out = Step()
     out.kind = kind
     out.index = index
@@ -59,7 +57,7 @@ def simple_step(kind: int, index: int, count: int) -> Step:
 @wp.func
 def box_step(index: int, count: int, lo: wp.vec3, hi: wp.vec3, t: float) -> Step:
     """Make the step of a bounding volume in the box lo .. hi. t: its entry distance, or inf."""
-    out = simple_step(BOX, index, count)
+    out = make_step(BOX, index, count)
     out.result = wp.where(t < wp.inf, ENTERED, 0)
     out.t = t
     out.lo = lo
@@ -78,7 +76,7 @@ def cell_step(index: int, count: int, lo: wp.vec3, hi: wp.vec3, t: float, t_end:
 @wp.func
 def plane_step(index: int, normal: wp.vec3, offset: float, t: float) -> Step:
     """Make the step of the plane dot(normal, p) + offset = 0 of node `index`, which the ray crosses at t."""
-    out = simple_step(PLANE, index, INNER)
+    out = make_step(PLANE, index, INNER)
     out.t = t
     out.lo = normal
     out.hi = wp.vec3(offset, 0.0, 0.0)
@@ -89,40 +87,10 @@ def plane_step(index: int, normal: wp.vec3, offset: float, t: float) -> Step:
 def part_step(plane: Step, above: bool, index: int, part: wp.vec2, entered: bool) -> Step:
     """Make the step of the child above or below a plane, whose `part` of the ray is (t, t_end). The child is an inner node."""
     sign = wp.where(above, -1.0, 1.0)
-    out = simple_step(PART, index, INNER)
+    out = make_step(PART, index, INNER)
     out.result = wp.where(entered, ENTERED, 0)
     out.t = part[0]
     out.t_end = part[1]
     out.lo = sign * plane.lo
     out.hi = sign * plane.hi
-    return out
-
-
-@wp.func
-def push_step(index: int, count: int, t: float, below: int) -> Step:
-    """Make the step of an entry that is pushed on top of `below` other entries; entries above it move up."""
-    out = simple_step(PUSH, index, count)
-    out.t = t
-    out.prim_id = below
-    return out
-
-
-@wp.func
-def pop_step(index: int, count: int, t: float, result: int) -> Step:
-    out = simple_step(POP, index, count)
-    out.t = t
-    out.result = result
-    return out
-
-
-@wp.func
-def test_step(index: int, prim_id: int, hit: Hit, edges: wp.vec3d, result: int) -> Step:
-    """Make the step of a primitive's test. hit: on the whole line, with t = inf on a miss."""
-    out = simple_step(TEST, index, 1)
-    out.prim_id = prim_id
-    out.result = result
-    out.t = hit.t
-    out.u = hit.u
-    out.v = hit.v
-    out.edges = edges
     return out

@@ -26,7 +26,7 @@ class BatchTraversal(WideTraversal):
         """Return the kernel of batch.make_kernel or instances.make_kernel, or None if the units have no vectorised form.
         Instances have none for cut-outs and lists. They have none for other box tests, whose rounding kernels.traverse.instances.enter
         does not cover."""
-        if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.resumes:
+        if units.triangle != "watertight" or units.box not in ROW_PADS or units.observer or units.resumes:
             return None
         if not units.instances:
             return batch.make_kernel(units, any_hit, rays_struct, accepts)

@@ -15,10 +15,9 @@ import warp as wp
 from wrt.kernels.query import LARGEST
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of, stack_type
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
-from wrt.kernels.traverse.recording import make_recorded_test, make_recording
+from wrt.kernels.traverse.observer import Recorder, make_observer, make_test
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
-from wrt.kernels.traverse.steps import ENTERED, INNER, LEAF, Step, box_step, simple_step
+from wrt.kernels.traverse.steps import ENTERED, INNER, box_step
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
 from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
@@ -128,16 +127,24 @@ def make_prefetch(record: Any, layout: NodeLayout) -> Any:
 
 
 def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
-    """Return test_leaf(accel, surfaces, reference, probe, rows, best) -> best Hit; with any_hit, it stops at the first hit."""
-    record = units.triangle_test.record
-    struct = make_struct(record)
-    test_row = make_row_test(units, any_hit, accepts, layout.width)
-    width, size_of_row = layout.width, row_size(record, layout.width)
+    """Return visit_leaf(accel, surfaces, reference, probe, rows, best) -> best Hit; with any_hit, it stops at the first hit."""
+    record, width = units.triangle_test.record, layout.width
+    struct, size_of_row = make_struct(record), row_size(record, width)
+    observe, test, gather = make_observer(units, 0), make_test(units, accepts), make_gather(record, width)
+    test_row = make_row_test(units, any_hit, accepts, width)
 
     @wp.func
-    def test_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
+    def visit_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
         begin = leaf_first(reference) * wp.static(layout.unit)
         end = begin + leaf_count(reference)
+        observe.leaf(accel.recorder, probe.ray, begin, end - begin)
+        if wp.static(units.observer == "log"):
+            for i in range(begin, end):  # one by one: the test of a row rejects primitives without a result to log
+                best = test(accel.recorder, probe, surfaces, gather(accel.primitives, i / width * size_of_row + i % width), i, best)
+            return best
+        if wp.static(units.observer == "sum"):
+            for i in range(begin, end):
+                observe.primitive(accel.recorder, probe.ray, i)
         while begin < end:
             row = begin / width
             lane = int(0)
@@ -152,103 +159,62 @@ def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
             begin = begin + n
         return best
 
-    return test_leaf
+    return visit_leaf
 
 
-def make_counting(units: Units, layout: NodeLayout) -> Any:
-    """Return count_node, count_leaf and count_pop, which return the new counts; and push and finish of counters.make_counters."""
-    struct = make_struct(units.triangle_test.record)
-    fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * layout.size)
-
-    @wp.func
-    def count_node(accel: struct, ray: Ray, counts: Counts, index: int) -> Counts:
-        if wp.static(units.counters):
-            boxes = int(0)
-            for j in range(wp.static(layout.width)):
-                if bits(accel.nodes, index * wp.static(layout.size) + wp.static(layout.references) + j) != EMPTY:
-                    boxes += 1
-            return fetch_node(accel.recorder, ray, counts, index, boxes)
-        return counts
-
-    @wp.func
-    def count_leaf(accel: struct, ray: Ray, counts: Counts, reference: int) -> Counts:
-        if wp.static(units.counters):
-            first = leaf_first(reference) * wp.static(layout.unit)
-            counts.leaves += 1
-            for j in range(leaf_count(reference)):
-                counts = fetch_primitive(accel.recorder, ray, counts, first + j)
-        return counts
-
-    @wp.func
-    def count_pop(counts: Counts) -> Counts:
-        if wp.static(units.counters):
-            counts.pops += 1
-        return counts
-
-    return count_node, count_leaf, count_pop, push, finish
-
-
-def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
-    """Return record_children, record_push, record_pop and recorded_leaf, which write the steps of kernels.traverse.steps."""
-    record, width = units.triangle_test.record, layout.width
-    struct = make_struct(record)
+def make_observed(units: Units, layout: NodeLayout) -> Any:
+    """Return observe_node, observe_push and observe_pop: kernels.traverse.observer for nodes and references of wide BVHs."""
+    width, struct = layout.width, make_struct(units.triangle_test.record)
     plane, _ = make_plane(width, layout.compressed)
     _, entry = make_children(width, layout.compressed, units.box)
-    record_pushed, record_popped = make_recording(units)
-    gather, recorded_test = make_gather(record, width), make_recorded_test(units, accepts)
+    observe = make_observer(units, 4 * layout.size)
 
     @wp.func
-    def child_of(reference: int) -> Step:
-        if reference < 0:
-            return simple_step(LEAF, leaf_first(reference) * wp.static(layout.unit), leaf_count(reference))
-        return simple_step(LEAF, reference, INNER)
+    def index_of(reference: int) -> int:
+        return wp.where(reference < 0, leaf_first(reference) * wp.static(layout.unit), reference)
 
     @wp.func
-    def record_children(accel: struct, slot: int, first: int, t: Any, mask: int, rows: LaneRay):
-        if wp.static(units.steps):
-            nodes = accel.nodes
+    def count_of(reference: int) -> int:
+        return wp.where(reference < 0, leaf_count(reference), INNER)
+
+    @wp.func
+    def observe_node(accel: struct, ray: Ray, index: int, t: Any, mask: int, rows: LaneRay):
+        """Node `index` is fetched, and the boxes of its children are tested; t, mask: the result of the test."""
+        if wp.static(units.observer != ""):
+            nodes, first, boxes = accel.nodes, index * wp.static(layout.size), int(0)
             for j in range(width):
-                reference = bits(nodes, first + wp.static(layout.references) + j)
-                if reference != EMPTY:
-                    lo = wp.vec3(plane(nodes, first, LO_X, j), plane(nodes, first, LO_Y, j), plane(nodes, first, LO_Z, j))
-                    hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
-                    begin = wp.where((mask >> j) & 1 != 0, entry(t, nodes, first, j, rows), float(wp.inf))
-                    child = child_of(reference)
-                    write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, begin))
+                boxes += wp.where(bits(nodes, first + wp.static(layout.references) + j) != EMPTY, 1, 0)
+            observe.node(accel.recorder, ray, index, boxes, 1)
+            if wp.static(units.observer == "log"):
+                for j in range(width):
+                    reference = bits(nodes, first + wp.static(layout.references) + j)
+                    if reference != EMPTY:
+                        lo = wp.vec3(plane(nodes, first, LO_X, j), plane(nodes, first, LO_Y, j), plane(nodes, first, LO_Z, j))
+                        hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
+                        begin = wp.where((mask >> j) & 1 != 0, entry(t, nodes, first, j, rows), float(wp.inf))
+                        observe.step(accel.recorder, ray, box_step(index_of(reference), count_of(reference), lo, hi, begin))
 
     @wp.func
-    def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
-        child = child_of(reference_of(key))
-        record_pushed(recorder, ray, child.index, child.count, t_of(key), below)
+    def observe_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int, size: int):
+        child = reference_of(key)
+        observe.push(recorder, ray, index_of(child), count_of(child), t_of(key), below, size)
 
     @wp.func
-    def record_pop(recorder: Recorder, ray: Ray, key: wp.uint64, best: Hit):
-        child = child_of(reference_of(key))
-        record_popped(recorder, ray, child.index, child.count, t_of(key), wp.where(t_of(key) <= best.t, ENTERED, 0))
+    def observe_pop(recorder: Recorder, ray: Ray, key: wp.uint64, taken: bool):
+        child = reference_of(key)
+        observe.pop(recorder, ray, index_of(child), count_of(child), t_of(key), wp.where(taken, ENTERED, 0))
 
-    @wp.func
-    def recorded_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
-        """Test all primitives of a leaf one by one. The test of a row rejects some of them; a record needs each test."""
-        leaf = child_of(reference)
-        write_step(accel.recorder, probe.ray.slot, leaf)
-        for i in range(leaf.index, leaf.index + leaf.count):
-            row = i / width
-            primitive = gather(accel.primitives, row * wp.static(row_size(record, width)) + i - row * width)
-            best = recorded_test(accel.recorder, probe, surfaces, primitive, i, best)
-        return best
-
-    return record_children, record_push, record_pop, recorded_leaf
+    return observe_node, observe_push, observe_pop
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
     """Return traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     struct = make_struct(units.triangle_test.record)
     children, entry = make_children(layout.width, layout.compressed, units.box)
-    probe_of = make_probe(units)
+    probe_of, finish = make_probe(units), make_observer(units, 0).finish
     prefetch_next = make_prefetch(units.triangle_test.record, layout)
-    count_node, count_leaf, count_pop, count_push, finish = make_counting(units, layout)
-    record_children, record_push, record_pop, recorded_leaf = make_recorded(units, accepts, layout)
-    visit_leaf = recorded_leaf if units.steps else make_leaf_test(units, any_hit, accepts, layout)
+    observe_node, observe_push, observe_pop = make_observed(units, layout)
+    visit_leaf = make_leaf_test(units, any_hit, accepts, layout)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
     entries = stack_type(wp.uint64)
 
@@ -260,17 +226,16 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         return reference
 
     @wp.func
-    def pop(recorder: Recorder, ray: Ray, stack: wp.ref[entries], shared: wp.uint64, size: int, counts: Counts, best: Hit):
+    def pop(recorder: Recorder, ray: Ray, stack: wp.ref[entries], shared: wp.uint64, size: int, best: Hit):
         """Return the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id."""
         reference = int(DONE)
         while size > 0 and reference == DONE:
             size = size - 1
-            counts = count_pop(counts)
             key = get(stack, shared, size)
-            record_pop(recorder, ray, key, best)
+            observe_pop(recorder, ray, key, t_of(key) <= best.t)
             if t_of(key) <= best.t:
                 reference = reference_of(key)
-        return reference, size, counts
+        return reference, size
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
@@ -278,7 +243,6 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         rows = lane_ray(probe, wp.static(far_pad(units.box)))
         best = no_hit(ray)
         best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # Finite, so that the ray enters no box that begins at infinity.
-        counts = Counts()
         stack = new_stack()
         shared = shared_stack()
         size = int(0)
@@ -286,9 +250,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         while reference != DONE:
             while reference >= 0 and reference != DONE:
                 first = reference * wp.static(layout.size)
-                counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
-                record_children(accel, ray.slot, first, t, mask, rows)
+                observe_node(accel, ray, reference, t, mask, rows)
                 if mask != 0:
                     lane, mask = lowest(mask), mask & (mask - 1)
                     near = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))
@@ -297,34 +260,33 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         lane, mask = lowest(mask), mask & (mask - 1)
                         key = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))
                         if wp.static(any_hit):
-                            record_push(accel.recorder, ray, near, size)
+                            observe_push(accel.recorder, ray, near, size, size + 1)
                             put(stack, shared, size, near)
                             near = key
                         else:
                             far = wp.max(near, key)
                             near = wp.min(near, key)
                             # Most nodes push two or three entries, so this does not sort them fully: the nearest pushed so far is on top.
+                            below = int(size)
                             if size > begin:
                                 under = get(stack, shared, size - 1)
-                                record_push(accel.recorder, ray, far, wp.where(far < under, size, size - 1))
+                                below = wp.where(far < under, size, size - 1)
                                 put(stack, shared, size, wp.min(far, under))
                                 put(stack, shared, size - 1, wp.max(far, under))
                             else:
-                                record_push(accel.recorder, ray, far, size)
                                 put(stack, shared, size, far)
+                            observe_push(accel.recorder, ray, far, below, size + 1)
                         size = size + 1
-                        counts = count_push(counts, size)
                     reference = reference_of(near)
                 else:
-                    reference, size, counts = pop(accel.recorder, ray, stack, shared, size, counts, best)
+                    reference, size = pop(accel.recorder, ray, stack, shared, size, best)
             if reference != DONE:
                 best = visit_leaf(accel, surfaces, reference, probe, rows, best)
-                counts = count_leaf(accel, ray, counts, reference)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
-                        return finish(accel.recorder, ray, counts, best)
-                reference, size, counts = pop(accel.recorder, ray, stack, shared, size, counts, best)
-        return finish(accel.recorder, ray, counts, best)
+                        return finish(accel.recorder, ray, best)
+                reference, size = pop(accel.recorder, ray, stack, shared, size, best)
+        return finish(accel.recorder, ray, best)
 
     return traverse
 

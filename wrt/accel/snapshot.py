@@ -49,9 +49,9 @@ class Snapshot:
         assert self.built is not None
         return self.built
 
-    def counting(self, data: WarpStruct, steps: bool = False) -> "Snapshot":
-        """Return the snapshot with `data` in place of its own data, for kernels that count, and that record each step if `steps`."""
-        units = self.structure.units._replace(counters=True, steps=steps)
+    def observed(self, data: WarpStruct, observer: str) -> "Snapshot":
+        """Return the snapshot with `data` in place of its own data, for kernels with an observer (Units.observer)."""
+        units = self.structure.units._replace(observer=observer)
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 

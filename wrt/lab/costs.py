@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.counting import copied
+from wrt.accel.queries.observed import copied
 from wrt.accel.structure import WrappedStructure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all
 from wrt.core.types import Device, WarpArray, WarpType
 from wrt.kernels.study import ray_log
-from wrt.kernels.traverse.counters import Counts, Recorder
+from wrt.kernels.traverse.observer import Counts, Recorder
 from wrt.kernels.warp_private import fields_of
 from wrt.renderer.film import DeviceFilm, Rectangle, Work
 from wrt.renderer.plan import Plan
@@ -29,7 +29,7 @@ class CostCounter:
     """A render that counts traversal steps. built: the scene prepared for pictures, whose structure and arrays the counter shares."""
 
     def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
-        counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
+        counting = plan.structure._replace(units=plan.structure.units._replace(observer="sum"))
         features = replace(plan.features, counting=True)
         self.prepared = prepare(replace(plan, structure=WrappedStructure(counting, ray_log), features=features), device, built)
 

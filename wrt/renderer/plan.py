@@ -84,7 +84,7 @@ class Plan:
     @property
     def by_waves(self) -> bool:
         """True if samples are traced in waves: on the CPU, unless rays are counted or recorded. Else a thread traces one ray at a time."""
-        return self.options.device == "cpu" and not self.structure.units.counters and not self.features.recording
+        return self.options.device == "cpu" and not self.structure.units.observer and not self.features.recording
 
     @property
     def wave_kernels(self) -> WaveKernels:

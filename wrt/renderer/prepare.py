@@ -91,7 +91,7 @@ class Prepared:
             return self.waves.launch(scene, limits, film)
         if isinstance(film, AovFilm):
             return aov_launch(self.device, self.kernels[1], scene, film)
-        by_pixels = self.device.is_cpu or self.plan.structure.units.counters
+        by_pixels = self.device.is_cpu or bool(self.plan.structure.units.observer)
         return film_launch(self.device, self.kernels[0], scene, limits, film, by_pixels)
 
     # --- called by workers (wrt.renderer.workers) ---

@@ -20,7 +20,8 @@ from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.traverse.counters import Counts, Recorder
+from wrt.kernels.traverse.observer import Observer, Recorder
+from wrt.kernels.traverse.steps import Step
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -120,35 +121,52 @@ def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_
     """The code for Turing has the same bytes as code compiled from a source whose counters do nothing."""
 
     @wp.func
-    def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:
-        return counts
+    def node(recorder: Recorder, ray: Ray, index: int, boxes: int, operations: int):
+        pass
 
     @wp.func
-    def fetch_primitive(recorder: Recorder, ray: Ray, counts: Counts, index: int) -> Counts:
-        return counts
+    def step(recorder: Recorder, ray: Ray, step: Step):
+        pass
 
     @wp.func
-    def push(counts: Counts, size: int) -> Counts:
-        return counts
+    def root(recorder: Recorder, ray: Ray, lo: wp.vec3, hi: wp.vec3, t: float):
+        pass
 
     @wp.func
-    def finish(recorder: Recorder, ray: Ray, counts: Counts, best: Hit) -> Hit:
+    def leaf(recorder: Recorder, ray: Ray, first: int, count: int):
+        pass
+
+    @wp.func
+    def primitive(recorder: Recorder, ray: Ray, index: int):
+        pass
+
+    @wp.func
+    def push(recorder: Recorder, ray: Ray, index: int, count: int, t: float, below: int, size: int):
+        pass
+
+    @wp.func
+    def pop(recorder: Recorder, ray: Ray, index: int, count: int, t: float, result: int):
+        pass
+
+    @wp.func
+    def finish(recorder: Recorder, ray: Ray, best: Hit) -> Hit:
         if best.prim_id == NO_HIT:
             best.t = float(wp.inf)
             best.prim_id = -1
         return best
 
+    empty = Observer(node, step, root, leaf, primitive, push, pop, finish)
     structure = Structure(ACCELERATORS[name])
     codes = []
-    for i, counting in enumerate((False, False, True) if name == "bvh2" else (False, False)):
-        units = Structure(ACCELERATORS[name], Units(counters=counting))
+    for i, observer in enumerate(("", "", "sum") if name == "bvh2" else ("", "")):
+        units = Structure(ACCELERATORS[name], Units(observer=observer))
         kernel = make_closest_hit_kernel(structure.struct, units.traversal(any_hit=False))
         codes.append(machine_code(kernel, tmp_path / str(i)))
         if i == 0:
             unit = structure.accel.kernels
             module = unit if inspect.ismodule(unit) else sys.modules[type(unit).__module__]
-            walk = module if hasattr(module, "make_counters") else traverse_bvh2  # Trees with other bounding volumes share this module.
-            monkeypatch.setattr(walk, "make_counters", lambda *_: (fetch_node, fetch_primitive, push, finish))
+            walk = module if hasattr(module, "make_observer") else traverse_bvh2  # Trees with other bounding volumes share this module.
+            monkeypatch.setattr(walk, "make_observer", lambda *_: empty)
         else:
             monkeypatch.undo()
     assert len(codes[0][0]) > 1000 and codes[0] == codes[1] and (len(codes) == 2 or codes[2] != codes[0])

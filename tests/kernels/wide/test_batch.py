@@ -275,7 +275,7 @@ def test_packets_are_given_up_where_they_fall_apart(any_hit, side):
 
 def test_units_without_lanes_have_no_stream():
     bvh8 = ACCELERATORS["bvh8"]
-    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(counters=True), Units(resumes=True)):
+    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(observer="sum"), Units(resumes=True)):
         assert tracer(Structure(bvh8, units), False).stream is None
     assert tracer(Structure(ACCELERATORS["bvh2"]), False).stream is None
     assert tracer(Structure(bvh8, Units(box="minmax")), True).stream is not None

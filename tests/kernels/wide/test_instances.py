@@ -191,7 +191,7 @@ def test_rays_of_pictures(any_hit):
 
 def test_without_a_vectorised_form_one_ray_is_traced_at_a_time():
     units = Units(instances=True)
-    for each in (units._replace(counters=True), units._replace(triangle="moller_trumbore"), units._replace(box="minmax")):
+    for each in (units._replace(observer="sum"), units._replace(triangle="moller_trumbore"), units._replace(box="minmax")):
         assert BatchTraversal().make_stream(each, False) is None
     assert BatchTraversal().make_stream(units, False, RenderRays, accepts=lambda *_: True) is None
     assert tracer(Structure(ACCELERATORS["bvh2"], units), False).stream is None

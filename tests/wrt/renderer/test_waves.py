@@ -202,6 +202,6 @@ def test_only_the_cpu_has_waves() -> None:
     on_cuda = copy(plan.options)
     on_cuda.device = "cuda:0"
     assert plan.by_waves and not replace(plan, options=on_cuda).by_waves
-    counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
+    counting = plan.structure._replace(units=plan.structure.units._replace(observer="sum"))
     assert not replace(plan, structure=counting).by_waves
     assert all(isinstance(kernel, wp.Kernel) for kernel in plan.kernels)

@@ -15,8 +15,8 @@ from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
 from wrt.accel.queries.batches import Query, trace_query
-from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
+from wrt.accel.queries.observed import counted
 from wrt.accel.queries.rays import are_rows, rays_of
 from wrt.accel.queries.shapes import flat_arrays, in_shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.tiles import tiled_width

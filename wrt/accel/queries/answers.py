@@ -32,11 +32,11 @@ class Counters:
     Attributes
     ----------
     counts : (...) structured array
-        Records of `kernels.traverse.counters.Counts`.
+        Records of `kernels.traverse.observer.Counts`.
     first : (N + 1,) int64
         Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i of N, in C order; all 0 without `trace=True`.
     address, size : (M,) int64
-        Address and size of each fetch in bytes. Addresses of primitives begin at kernels.traverse.counters.PRIMITIVE_SPACE.
+        Address and size of each fetch in bytes. Addresses of primitives begin at kernels.traverse.observer.PRIMITIVE_SPACE.
     """
 
     counts: np.ndarray

@@ -9,7 +9,7 @@ from wrt.accel.queries.answers import Counters
 from wrt.core.device import launch, start, upload
 from wrt.core.threads import thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 
 LINE = 128  # bytes of a cache line on NVIDIA GPUs since Volta
 

@@ -14,7 +14,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.query import RayArrays
 from wrt.kernels.structs import Primitive, size_of
 from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, counters_of, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
 from wrt.lab.plans import Float64 as Plan

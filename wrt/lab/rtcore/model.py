@@ -111,7 +111,7 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:
     """Return the SIMT efficiency for the warps `warp`, for the rays packed into full warps, and for rays sorted by coherence and packed.
-    The cost of a ray is its number of box operations and triangle tests. counts: (N,) kernels.traverse.counters.Counts."""
+    The cost of a ray is its number of box operations and triangle tests. counts: (N,) kernels.traverse.observer.Counts."""
     cost = counts["box_operations"].astype(np.float64) + counts["primitives"]
     order = by_coherence(origins, directions)
     return {"as they come": efficiency(cost, warp), "packed": efficiency(cost, packed(len(cost))),

@@ -20,7 +20,7 @@ from wrt.core.types import PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.shade.paths import BRANCHES, COATED, REFLECTED
 from wrt.kernels.study import ray_log
-from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
+from wrt.kernels.traverse.observer import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
 from wrt.renderer.film import Rectangle
@@ -50,7 +50,7 @@ TRACE_LIMIT = 4_000_000  # largest number of recorded fetches, about
 class Rays:
     """Every ray of a picture, arrays (N,): sorted by tile, then by pixel, then in the order of tracing.
 
-    - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: number of distinct cache lines.
+    - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.observer.Counts; lines: number of distinct cache lines.
     - pixel: row * width + column; kind: index in KINDS. A clear coat's reflection is a "reflection",
       too. A "straight" ray continues through a blended surface without refraction.
     - depth: bounces before the ray; a shadow ray has the depth of the ray whose hit it starts from.

@@ -12,15 +12,15 @@ import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Counters
+from wrt.accel.queries.observed import RAYS_AT_ONCE, RecordedSteps, record_steps
 from wrt.accel.queries.rays import Rays, rays_of
-from wrt.accel.queries.recorded_steps import RAYS_AT_ONCE, RecordedSteps, record_steps
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
 from wrt.core.files import require_file, write_bytes
 from wrt.core.tables import TABLES, write_table
 from wrt.core.types import ArrayLike, PathLike
 from wrt.kernels.traverse import steps as of
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import Prefetches
 from wrt.lab.rtcore.model import Prediction, Work, predict
 from wrt.lab.rtcore.parameters import BASE, GPUS, Core

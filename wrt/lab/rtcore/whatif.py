@@ -18,7 +18,7 @@ from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study, child_0_first
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, mesh_name, tabled
 from wrt.lab.bench.report import run as run

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.recorded_steps import RecordedSteps
+from wrt.accel.queries.observed import RecordedSteps
 from wrt.core.types import JsonObject
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.regions import Region, regions_of

@@ -10,7 +10,7 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.queries.recorded_steps import record_steps
+from wrt.accel.queries.observed import record_steps
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 from wrt.core.files import write_bytes

@@ -17,14 +17,14 @@ import wrt.accel.cells.bsp as module
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
 from wrt.accel.cells.bsp import Bsp
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.counting import copied
+from wrt.accel.queries.observed import copied
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.scenes.build import build
 from wrt.core.device import on_host
 from wrt.kernels.query import HitArrays, make_closest_hit_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.bsp import PLANE, STACK_SIZE
-from wrt.kernels.traverse.counters import Counts
+from wrt.kernels.traverse.observer import Counts
 from wrt.scene.shapes import icosphere
 
 
@@ -212,7 +212,7 @@ def never(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
 def refusing_kernel():
     """Make a kernel that counts and rejects every hit, so that a ray traverses the whole structure."""
     structure = build(icosphere(0), "bsp").structure
-    structure = structure._replace(units=structure.units._replace(counters=True))
+    structure = structure._replace(units=structure.units._replace(observer="sum"))
     return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False, accepts=never))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import LINE, Cache, Misses, Prefetches, distinct_lines, first_level, lines_of, replay, second_level
 from wrt.scene.shapes import icosphere
 

@@ -9,7 +9,7 @@ import pytest
 
 from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE, Counts
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE, Counts
 from wrt.lab.rtcore.caches import LINE, Cache
 from wrt.lab.rtcore.model import TERMS, Work, predict, sensitivity, simt, span, sweep, trace_rays
 from wrt.lab.rtcore.parameters import ASSUMED, DERIVED, GPUS, PARAMETERS, PUBLISHED, SWEEPS, Core, Gpu

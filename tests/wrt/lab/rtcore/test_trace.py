@@ -18,7 +18,7 @@ import wrt
 from tests.command_line import wrt as command
 from tests.data import ROOT, data_path
 from tests.structures import families_first
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.rtcore.model import trace_rays
 from wrt.lab.rtcore.trace import BOX, PRIMITIVE, Trace
 from wrt.scene.shapes import icosphere

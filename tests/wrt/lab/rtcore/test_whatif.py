@@ -16,7 +16,7 @@ from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.kernels.study.bvh2_study import STACK_SIZE, Study, child_0_first
-from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
+from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.report import text
 from wrt.lab.rtcore.parameters import SWEEPS
 from wrt.lab.rtcore.whatif import STUDIES, Plan, quantised, resized, run, with_planes, with_traversal

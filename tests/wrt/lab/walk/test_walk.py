@@ -12,7 +12,7 @@ import wrt
 from tests import device
 from tests.data import data_path
 from tests.structures import STRUCTURES, families_first
-from wrt.accel.queries.recorded_steps import record_steps
+from wrt.accel.queries.observed import record_steps
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.drawing import section_of
 from wrt.lab.walk.record import Entry, counted

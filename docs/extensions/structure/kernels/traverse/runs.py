@@ -7,8 +7,8 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.observer import Counts, Recorder, make_counters
 
 
 @wp.struct

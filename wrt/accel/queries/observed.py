@@ -1,20 +1,27 @@
-"""Steps of rays through a structure, from the recorder that counts: the source of `wrt.walk` and `wrt.trace`."""
+"""Queries with an observer (kernels.traverse.observer): counters, fetches, and the steps that `wrt.walk` and `wrt.trace` read."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
-from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.queries.answers import HIT_TYPES, answer_arrays
-from wrt.accel.queries.batches import Query
-from wrt.accel.queries.counting import recorded
+from wrt.accel.queries.answers import HIT_TYPES, Counters, answer_arrays
+from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.rays import rays_of
+from wrt.accel.snapshot import Snapshot
 from wrt.core.checks import shown
+from wrt.core.device import on_host, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike
+from wrt.core.types import ArrayLike, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.structs import size_of
 from wrt.kernels.traverse import steps as of
+from wrt.kernels.traverse.observer import SIZE_RANGE, Counts
+
+if TYPE_CHECKING:
+    from wrt.accel.queries.accelerator import Accelerator
 
 RAYS_AT_ONCE = 1 << 12  # rays whose steps are in memory at once, about 10 kB each
 
@@ -66,18 +73,50 @@ class RecordedSteps:
         return out
 
 
-def record_steps(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+def copied(data: WarpStruct) -> WarpStruct:
+    """Copy a Warp struct but not its arrays, so that fields of the copy can be set."""
+    out = type(data)()
+    out.assign(data)
+    return out
+
+
+def observed(snapshot: Snapshot, query: Query, observer: str, first: np.ndarray, fetches: int = 0, steps: int = 0) -> WarpStruct:
+    """Trace the query with an observer (Units.observer), and return its Recorder. first: as there; fetches, steps: lengths of arrays."""
+    own, device = copied(snapshot.data), snapshot.device  # a copy, because each call needs a recorder of its own
+    own.recorder.counts = wp.zeros(len(query.out[0]), dtype=Counts, device=device)
+    own.recorder.first = upload(first, wp.int64, device)
+    own.recorder.fetches = wp.zeros(fetches, dtype=wp.int64, device=device)
+    own.recorder.steps = wp.zeros(steps, dtype=of.Step, device=device)
+    trace_query(snapshot.observed(own, observer), query)
+    return own.recorder
+
+
+def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
+    """Trace the query and count its costs. fetches_too: record each fetch in a second run, after a first run that counts fetches."""
+    refuse_capture(snapshot.device)
+    counts = on_host(observed(snapshot, query, "sum", np.zeros(0, np.int64)).counts)
+    first, fetches = np.zeros(len(counts) + 1, np.int64), np.zeros(0, np.int64)
+    if fetches_too:
+        np.cumsum(counts["nodes"].astype(np.int64) + counts["primitives"], out=first[1:])
+        fetches = on_host(observed(snapshot, query, "sum", first, fetches=int(first[-1])).fetches)
+    return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
+
+
+def record_steps(accel: "Accelerator", origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
                  t_max: ArrayLike = np.inf) -> RecordedSteps:
     """Trace closest hits and record every step. Raises InputError for invalid rays, and for instances."""
-    if not isinstance(accel, Accelerator):
+    snapshot = getattr(accel, "snapshot", None)
+    if not isinstance(snapshot, Snapshot):
         raise InputError(f"must be a structure (wrt.build), got {shown(accel)}", argument="accel")
-    if accel.structure.units.instances:
+    if snapshot.structure.units.instances:
         raise InputError("must be a structure over one mesh, not over instances", argument="accel",
                          hint="wrt.build(mesh) over one of the meshes, or wrt.build(wrt.Scene.of(meshes)) over all")
-    snapshot = accel.snapshot
     rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True, snapshot.geometry.origin)
     out = answer_arrays(HIT_TYPES, None, len(rays.origins), None, False)
-    counts, first, steps = recorded(snapshot, Query(rays, out, thread_count(None)))
+    query, first = Query(rays, out, thread_count(None)), np.zeros(len(rays.origins) + 1, np.int64)
+    np.cumsum(on_host(observed(snapshot, query, "log", np.zeros(len(rays.origins), np.int64)).first), out=first[1:])
+    recorder = observed(snapshot, query, "log", first[:-1].copy(), steps=int(first[-1]))
+    counts, steps = on_host(recorder.counts), on_host(recorder.steps)
     nodes, primitives = (int(counts[name].sum(dtype=np.int64)) for name in ("nodes", "primitives"))
     found = np.bincount(steps["kind"], minlength=len(of.KINDS))
     if found[of.NODE] != nodes or found[of.TEST] != primitives:
