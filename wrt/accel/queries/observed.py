@@ -1,7 +1,6 @@
 """Queries with an observer (kernels.traverse.observer): counters, fetches, and the steps that `wrt.walk` and `wrt.trace` read."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -19,9 +18,6 @@ from wrt.core.warp_private import refuse_capture
 from wrt.kernels.structs import size_of
 from wrt.kernels.traverse import steps as of
 from wrt.kernels.traverse.observer import SIZE_RANGE, Counts
-
-if TYPE_CHECKING:
-    from wrt.accel.queries.accelerator import Accelerator
 
 RAYS_AT_ONCE = 1 << 12  # rays whose steps are in memory at once, about 10 kB each
 
@@ -102,7 +98,7 @@ def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
     return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
 
-def record_steps(accel: "Accelerator", origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+def record_steps(accel: object, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
                  t_max: ArrayLike = np.inf) -> RecordedSteps:
     """Trace closest hits and record every step. Raises InputError for invalid rays, and for instances."""
     snapshot = getattr(accel, "snapshot", None)

@@ -8,7 +8,7 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.leaf import make_leaf
-from wrt.kernels.traverse.observer import Counts, Recorder, make_counters
+from wrt.kernels.traverse.observer import Recorder, make_observer
 
 
 @wp.struct
@@ -36,23 +36,21 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test
-    fetch_node, _, _, finish = make_counters(units, Run.numpy_dtype()["itemsize"])
+    observe = make_observer(units, Run.numpy_dtype()["itemsize"])
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
-        counts = Counts()
         for i in range(accel.nodes.shape[0]):
             run = accel.nodes[i]
-            counts = fetch_node(accel.recorder, ray, counts, i, 1)
+            observe.node(accel.recorder, ray, i, 1, 1)
             if ray_aabb(probe.box, run.lo, run.hi, best.t) < wp.inf:
-                counts.leaves += 1
-                best, counts = visit_leaf(accel, surfaces, probe, run.first, run.count, best, counts)
+                best = visit_leaf(accel, surfaces, probe, run.first, run.count, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
-        return finish(accel.recorder, ray, counts, best)
+        return observe.finish(accel.recorder, ray, best)
 
     return traverse
