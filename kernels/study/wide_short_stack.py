@@ -19,8 +19,7 @@ Flags = wp.types.vector(CAPACITY, wp.int32)
 @kernel
 def walk_short(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, entries: int, out: wp.array(dtype=Work)):
     """Trace ray tid with a stack of `entries` entries, 0 to CAPACITY, nearest child first, popped entries culled. Same hits as a full
-    stack.
-    The trees have at most LEVELS levels."""
+    stack. The trees have at most LEVELS levels."""
     i = wp.tid()
     ray = make_ray(rays.origin[i], rays.direction[i])
     ray.t_max = rays.t_max[i]

@@ -83,11 +83,9 @@ class Observer(NamedTuple):
     finish: Any  # (recorder, ray, best) -> Hit: count the ray, and return the walk's result; a miss gets t = inf and prim_id = -1.
 
 
-def make_observer(units: Units, node_bytes: int) -> Observer:
-    """Return the observer of a walk through nodes of `node_bytes` bytes. Steps name a child by `index` and `count` (steps.py)."""
-    observed, logged = units.observer != "", units.observer == "log"
-    node_size = int(node_bytes)
-    primitive_size = size_of(units.triangle_test.record)
+def make_visits(units: Units, node_bytes: int) -> Any:
+    """Return node, root and leaf of an Observer."""
+    observed, logged, size = units.observer != "", units.observer == "log", int(node_bytes)
 
     @wp.func
     def node(recorder: Recorder, ray: Ray, index: int, boxes: int, operations: int):
@@ -95,16 +93,11 @@ def make_observer(units: Units, node_bytes: int) -> Observer:
             write_step(recorder, ray.slot, make_step(NODE, index, 0))
         if wp.static(observed):
             if wp.static(not logged):
-                write_fetch(recorder, ray.slot, wp.int64(index) * wp.int64(wp.static(node_size)), wp.static(node_size))
+                write_fetch(recorder, ray.slot, wp.int64(index) * wp.int64(wp.static(size)), wp.static(size))
             recorder.counts[ray.slot].nodes += 1
             recorder.counts[ray.slot].boxes += boxes
             recorder.counts[ray.slot].box_operations += operations
-            recorder.counts[ray.slot].node_bytes += wp.static(node_size)
-
-    @wp.func
-    def step(recorder: Recorder, ray: Ray, step: Step):
-        if wp.static(logged):
-            write_step(recorder, ray.slot, step)
+            recorder.counts[ray.slot].node_bytes += wp.static(size)
 
     @wp.func
     def root(recorder: Recorder, ray: Ray, lo: wp.vec3, hi: wp.vec3, t: float):
@@ -121,14 +114,28 @@ def make_observer(units: Units, node_bytes: int) -> Observer:
         if wp.static(observed):
             recorder.counts[ray.slot].leaves += 1
 
+    return node, root, leaf
+
+
+def make_primitive(units: Units) -> Any:
+    """Return `primitive` of an Observer."""
+    observed, logged, size = units.observer != "", units.observer == "log", size_of(units.triangle_test.record)
+
     @wp.func
     def primitive(recorder: Recorder, ray: Ray, index: int):
         if wp.static(observed):
             if wp.static(not logged):
-                address = PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(primitive_size))
-                write_fetch(recorder, ray.slot, address, wp.static(primitive_size))
+                address = PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(size))
+                write_fetch(recorder, ray.slot, address, wp.static(size))
             recorder.counts[ray.slot].primitives += 1
-            recorder.counts[ray.slot].primitive_bytes += wp.static(primitive_size)
+            recorder.counts[ray.slot].primitive_bytes += wp.static(size)
+
+    return primitive
+
+
+def make_stack_steps(units: Units) -> Any:
+    """Return push and pop of an Observer."""
+    observed, logged = units.observer != "", units.observer == "log"
 
     @wp.func
     def push(recorder: Recorder, ray: Ray, index: int, count: int, t: float, below: int, size: int):
@@ -151,23 +158,36 @@ def make_observer(units: Units, node_bytes: int) -> Observer:
         if wp.static(observed):
             recorder.counts[ray.slot].pops += 1
 
+    return push, pop
+
+
+def make_observer(units: Units, node_bytes: int) -> Observer:
+    """Return the observer of a walk through nodes of `node_bytes` bytes. Steps name a child by `index` and `count` (steps.py)."""
+
+    @wp.func
+    def step(recorder: Recorder, ray: Ray, step: Step):
+        if wp.static(units.observer == "log"):
+            write_step(recorder, ray.slot, step)
+
     @wp.func
     def finish(recorder: Recorder, ray: Ray, best: Hit) -> Hit:
-        if wp.static(observed and not units.instances):  # with instances, the upper level counts the ray
+        if wp.static(units.observer != "" and not units.instances):  # with instances, the upper level counts the ray
             recorder.counts[ray.slot].probes += 1
         if best.prim_id == NO_HIT:
             best.t = float(wp.inf)
             best.prim_id = -1
         return best
 
-    return Observer(node, step, root, leaf, primitive, push, pop, finish)
+    node, root, leaf = make_visits(units, node_bytes)
+    push, pop = make_stack_steps(units)
+    return Observer(node, step, root, leaf, make_primitive(units), push, pop, finish)
 
 
 def make_test(units: Units, accepts: Any = None) -> Any:
     """Return test(recorder, probe, surfaces, primitive, index, best) -> Hit, which tests the primitive at `index` and returns the better
     hit, as common.make_intersect does, and observes the test."""
     intersect = make_intersect(units, accepts)
-    count_primitive = make_observer(units, 0).primitive
+    count_primitive = make_primitive(units)
     record = units.triangle_test.record
 
     @wp.func
