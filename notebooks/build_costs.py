@@ -90,14 +90,14 @@ assert differ <= 1e-3 * raster.size  # pixels whose middle lies on an edge, with
 # %%
 plan = visibility.Plan(meshes=(), size=64 if QUICK else 256, max_size=128 if QUICK else 1024, max_triangles=MOST, runs=RUNS)
 rows = [row for row in report.run(plan) if row.surface == "terrain"]
-assert all(row.agreement.unexplained == 0 for row in rows)
+assert all(row.differ <= 1e-3 * row.pixels for row in rows)
 fig, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), dpi=80, layout="constrained")
 for ax, sweep, fixed in ((axes[0], "triangles", f"{plan.size} x {plan.size} pixels"), (axes[1], "pixels", "about 80,000 triangles")):
     line = sorted((row for row in rows if row.sweep == sweep), key=lambda row: getattr(row, sweep))
     at = [getattr(row, sweep) for row in line]
     ax.loglog(at, [1e3 * min(row.raster) for row in line], "s-", label="rasterising")
     ax.loglog(at, [1e3 * min(row.cast) for row in line], "o-", label="casting rays")
-    ax.loglog(at, [1e3 * (min(row.cast) + min(row.build)) for row in line], "o:", color="C1", label="and building the structure")
+    ax.loglog(at, [1e3 * (min(row.cast) + row.build) for row in line], "o:", color="C1", label="and building the structure")
     ax.set(xlabel=sweep, ylabel="milliseconds", title=fixed)
 axes[0].legend(fontsize=8)
 plt.show()

@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench.visibility import terrain
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.rtcore import whatif
 from wrt.lab.rtcore.model import TERMS
 from wrt.lab.rtcore.parameters import BASE, GPUS

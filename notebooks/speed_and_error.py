@@ -14,8 +14,8 @@ import numpy as np
 
 import wrt
 from wrt.lab.bench import error
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.bench.visibility import terrain
 from wrt.lab.oracle.oracle import closest, t_bound
 from wrt.picture.heatmap import colored
 
@@ -191,7 +191,7 @@ plt.show()
 # many.
 # </details>
 #
-# **4.** `python -m wrt bench units` compares the times of the triangle tests. Are more exact tests slower?
+# **4.** `python -m wrt bench queries bvh8 bvh8:triangle=plane` compares two triangle tests. Are more exact tests slower?
 # <details><summary>Solution</summary>
 #
 # Hardly. On a busy machine, the watertight test took up to 1.1 times as long as the other triangle tests for rays from a camera, and 1.1

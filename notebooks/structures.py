@@ -13,9 +13,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench import accel as bench
-from wrt.lab.bench.accel import in_stadium
+from wrt.lab.bench import Queries
+from wrt.lab.bench.meshes import in_stadium
 from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.report import run
 from wrt.picture.heatmap import heatmap
 from wrt.scene.shapes import teapot
 
@@ -113,11 +114,11 @@ plt.show()
 
 # %% [markdown]
 # ## Build time and query time
-# `wrt.lab.bench.accel` measures build time, query time and memory, and checks every hit: `differ` and `wrong` must be 0. The mesh is the
+# `wrt bench queries` measures build time, query time and memory, and checks every hit: `differ` and `wrong` must be 0. The mesh is the
 # pot alone.
 
 # %%
-report = bench.run(bench.Plan((pot,), (*STRUCTURES, "bvh8"), ("diffuse",), rays=RAYS, runs=7))
+report = run(Queries((*STRUCTURES, "bvh8"), (pot,), ("diffuse",), number=RAYS, runs=7))
 assert all(row.differ == row.wrong == 0 for row in report)
 report
 
@@ -126,12 +127,12 @@ report
 # at a number of rays is the best structure for it.
 
 # %%
-(brute,) = bench.run(bench.Plan((pot,), ("brute_force",), ("diffuse",), rays=RAYS // 20, runs=3))
+(brute,) = run(Queries(("brute_force",), (pot,), ("diffuse",), number=RAYS // 20, runs=3))
 rays = np.geomspace(1, 1e8, 200)
 fig, ax = plt.subplots(figsize=(6.4, 3.6), dpi=80, layout="constrained")
 for row in (*report, brute):
     seconds = np.median(row.build) + rays * np.median(row.seconds) / row.rays
-    ax.loglog(rays, seconds, label=row.structure, linewidth=1.8)
+    ax.loglog(rays, seconds, label=row.name, linewidth=1.8)
 ax.axvline(640 * 360, color="0.7", linewidth=1)
 ax.text(640 * 360 * 1.2, ax.get_ylim()[0] * 1.5, "one ray a pixel\nof 640x360", color="0.4", fontsize=9)
 ax.set(xlabel="rays", ylabel="seconds to build and trace")
@@ -140,7 +141,7 @@ plt.show()
 
 for row in report:
     saved = np.median(brute.seconds) / brute.rays - np.median(row.seconds) / row.rays
-    print(f"{row.structure:7} has paid for itself after {max(np.median(row.build) - np.median(brute.build), 0) / saved:6.0f} rays")
+    print(f"{row.name:7} has paid for itself after {max(np.median(row.build) - np.median(brute.build), 0) / saved:6.0f} rays")
 
 # %% [markdown]
 # ## Which tree?
@@ -210,7 +211,7 @@ wrt.side_by_side({builder: heatmap(maps[builder], "steps of a ray", top=80.0) fo
 # <details><summary>Solution</summary>
 #
 # The memory is 57 % of that of `bvh8`. The picture's rays take 14.1 steps instead of 12.0, because boxes with planes of 8 bits are larger.
-# `bench.run` with both names measures the time on your machine.
+# `python -m wrt bench queries bvh8 bvh8c` measures the time on your machine.
 # </details>
 #
 # **4.** From which number of rays on is building and querying a k-d tree faster than `bvh2`, if ever?

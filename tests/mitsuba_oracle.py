@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.mitsuba_whitted import whitted
 from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba, translate
 from wrt.renderer.pixel_rays import camera_rays
@@ -20,7 +21,7 @@ from wrt.scene.model import Scene
 def to_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Any:
     """Translate the scene to a `mitsuba.Scene` of variant scalar_rgb."""
     with mitsuba() as mi:
-        return translate(mi, scene, camera, integrator).scene
+        return translate(mi, scene, camera, whitted if integrator == "whitted" else integrator).scene
 
 
 class Rendering(NamedTuple):
@@ -33,7 +34,9 @@ class Rendering(NamedTuple):
 
 def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, *, seed: int = 0, integrator: str = "auto",
                    **settings: Any) -> Rendering:
-    """Render with Mitsuba; settings: settings of the scene to change. spp is rounded up to a multiple of the samples per pass.
+    """Render with Mitsuba; settings: settings of the scene to change. integrator: as for `translate`, or "whitted".
+
+    spp is rounded up to a multiple of the samples per pass.
 
     The variance of the mean is estimated from 32 or more passes (fewer if spp is below 32) with different seeds; None for one pass.
     """
@@ -41,7 +44,7 @@ def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, *
     per_pass = max(1, scene.settings.spp // 32)
     passes = math.ceil(scene.settings.spp / per_pass)
     with mitsuba() as mi:
-        translated = translate(mi, scene, camera, integrator).scene
+        translated = translate(mi, scene, camera, whitted if integrator == "whitted" else integrator).scene
         pictures = np.stack([np.array(mi.render(translated, spp=per_pass, seed=seed * passes + index), dtype=np.float64)
                              for index in range(passes)])
     variance = pictures.var(axis=0, ddof=1) / passes if passes > 1 else None

@@ -136,8 +136,8 @@ def peers() -> str:
 
 def queries() -> str:
     """Draw a bar for each kind of ray and each library in its best mode; the time is a geometric mean over the meshes."""
-    names = {"wrt bvh8": "wrt", "tinybvh": "tinybvh", "Embree robust": "Embree robust", "Embree fast": "Embree fast",
-             "Open3D RaycastingScene": "Open3D", "trimesh.ray with embreex": "trimesh", "Warp mesh_query_ray": "Warp"}
+    names = {"bvh8": "wrt", "tinybvh": "tinybvh", "embree": "Embree robust", "embree:mode=fast": "Embree fast", "open3d": "Open3D",
+             "trimesh": "trimesh", "warp": "Warp"}
     best: dict[tuple[str, str], dict[str, float]] = {}
     for row in read("queries"):
         modes = best.setdefault((row["kind"], row["library"]), {})

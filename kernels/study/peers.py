@@ -7,8 +7,8 @@ from wrt.kernels.structs import kernel
 
 @kernel
 def warp_mesh_query(mesh: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
-                    t: wp.array(dtype=wp.float32), u: wp.array(dtype=wp.float32), v: wp.array(dtype=wp.float32),
-                    prim_id: wp.array(dtype=wp.int32)):
+                    t: wp.array(dtype=wp.float32), prim_id: wp.array(dtype=wp.int32), u: wp.array(dtype=wp.float32),
+                    v: wp.array(dtype=wp.float32)):
     """Store the closest hit of each ray; a miss has prim_id = -1. Directions must have unit length."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e38)

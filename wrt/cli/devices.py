@@ -9,8 +9,8 @@ from wrt.core.errors import InputError
 
 
 @click.command()
-@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 if"
-                                            " a bit differs. Compiling all kernels takes minutes")
+@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit; exit code 1 if a bit differs. Compiling"
+                                            " all kernels takes minutes")
 @click.option("--device", help="Device for --check: cuda:0 ...  [default: cuda:0; without a GPU: cpu]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
               help="Scene file for --check; repeatable  [default: the scenes of wrt]")
@@ -29,15 +29,15 @@ def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int
         else:
             click.echo("\n".join(lines))
         return
-    from wrt.lab.device_check import Check, run
+    from wrt.lab.device_check import run, text
 
     without_a_gpu = not any(line.startswith("cuda:0") for line in describe_devices())
-    plan = Check(device or ("cpu" if without_a_gpu else "cuda:0"), scenes, 20_000 if rays is None else rays)
     with warnings_reported(quiet):
-        result = run(plan, (lambda line: None) if quiet else say)
+        result = run(device or ("cpu" if without_a_gpu else "cuda:0"), scenes, 20_000 if rays is None else rays,
+                     (lambda line: None) if quiet else say)
     if as_json:
         say_json(result.as_dict())
     else:
-        click.echo(result.text())
+        click.echo(text(result))
     if result.differ:
         raise SystemExit(1)

@@ -3,15 +3,17 @@
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import click
 
 from wrt.cli.common import SIZE, Assignments, Commands, Parsed, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.core.registry import Registry
-from wrt.lab import plans
-from wrt.lab.plans import Error, Mitsuba, Stability
+from wrt.lab.bench import Error, Pictures, Queries, Visibility
+from wrt.lab.claims import Claims
+from wrt.lab.hard_cases import Closed, Stability
+from wrt.lab.mitsuba import Mitsuba
+from wrt.lab.rtcore import MODELLED, Float64, RtCore, WhatIf
 
 BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches", click.Command)
 
@@ -36,17 +38,16 @@ def bench(context: click.Context, quick: bool) -> None:
             command.invoke(each)
 
 
-for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,
-             plans.Pictures, plans.Closed, plans.Claims):
+for plan in (Queries, Visibility, Pictures, Closed, RtCore, Float64, Claims):
     bench.add_command(measured(plan))
-whatif = measured(plans.WhatIf)
+whatif, stability = measured(WhatIf), measured(Stability)
 
 
 @click.command()
 @shared("scene", "size")
 @click.option("--spp", type=int, default=1, show_default=True, help="Samples per pixel")
 @shared("max_depth", "assignments", "crop", "camera", "accel", "seed", "threads")
-@click.option("--gpu", default="rtx2080ti", show_default=True, help=plans.MODELLED)
+@click.option("--gpu", default="rtx2080ti", show_default=True, help=MODELLED)
 @reporting("Folder for heat maps, EXR layers, histograms and a report")
 def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **options: Parsed) -> None:
     """Count the work of the rays of SCENE, and model an RT core. Count by pixel, kind of ray and depth; estimate the time on the core."""
@@ -70,28 +71,6 @@ def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **o
                    "by_depth": found.by_depth(), "model": [row.as_dict() for row in rows], "output": paths}, paths)
 
 
-@click.command(help=Stability.__doc__)
-@planned(Stability)
-@reporting(Stability.OUTPUT, quiet="Print no progress")
-def stability(how: Reporting, plan: Stability) -> None:
-    from wrt.lab.bench.report import cells, csv_file
-    from wrt.lab.hard_cases import report
-    from wrt.lab.hard_cases import stability as study
-
-    def row_done(row: Any) -> None:
-        if not how.as_json:
-            say("  ".join(cells(study.COLUMNS, row)), err=False)
-
-    how.check_report((".json", ".csv"))
-    if not how.as_json:
-        say("  ".join(study.COLUMNS), err=False)
-    machine = report.machine(plan)
-    result = study.run(plan, row_done, how.progress_writer)
-    data = {"machine": machine, **result.as_dict()}
-    how.write_rows(data, report.text(result, plan, machine), {".csv": lambda: csv_file(result.rows, plan, machine, ".csv")})
-    how.end(f"\n{report.summary(result)}", {**data, "output": how.output}, interrupted=result.interrupted)
-
-
 @bench.command()
 @shared("scene")
 @planned(Error)
@@ -103,7 +82,6 @@ def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, si
     """Render SCENE with various values of each option. Compare time and error of the pictures with a converged
     reference."""
     from wrt.lab.bench import error as study
-    from wrt.lab.bench import error_report as report
     from wrt.renderer.options import Options
 
     rendering = Options(**options)
@@ -112,7 +90,7 @@ def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, si
     loaded = load(scene, how.quiet).with_settings(**settings).with_settings(size=size)
     with warnings_reported(how.quiet), naming(scene):
         result = study.sweep(loaded, plan, rendering, how.progress)
-    text = report.text(result)
+    text = study.text(result)
     how.write(text)
     how.end(text, {**result.as_dict(), "output": how.output}, interrupted=result.interrupted)
 

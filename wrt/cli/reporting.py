@@ -31,11 +31,11 @@ from wrt.cli.common import (
 from wrt.core.errors import InputError
 from wrt.core.files import check_writable, write_bytes
 from wrt.core.interrupts import exit_code
-from wrt.lab.plans import STRUCTURES, Plan
+from wrt.lab import STRUCTURES, Plan
 from wrt.renderer.progress import TimeLeft
 
-# The type of an option, by the annotation of the plan's field. Any other annotation means a path.
-TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, Sequence[str]: Names(), float: DURATION}
+# The type of an option, by the annotation of the plan's field.
+TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, float: DURATION}
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def reporting(report: str = "Write the tables as Markdown (.md)", *, quiet: str 
 
 
 def planned(plan: type[Plan]) -> Decorator:
-    """Return a decorator that adds the options of a Plan (wrt.lab.plans). The command receives the object as `plan`.
+    """Return a decorator that adds the options of a Plan (wrt.lab). The command receives the object as `plan`.
 
     --quick sets the options that the command line leaves out to the values in plan.QUICK, and lists them on stderr."""
 
@@ -127,23 +127,22 @@ def planned(plan: type[Plan]) -> Decorator:
 
 def parameter(each: dataclasses.Field[object], of_type: object) -> Decorator:
     """Return a decorator that adds a plan's field `each` to a command, as an argument or an option."""
-    known, needed = each.metadata, each.default is MISSING
-    kind = TYPES.get(of_type, click.Path(path_type=Path))
-    if not known["text"]:
-        several: dict[str, Any] = {"nargs": -1, "required": needed} if get_origin(of_type) is Sequence else {}
-        kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
-        return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
+    text, names, needed = each.metadata["text"], each.metadata["of"], each.default is MISSING
+    several = get_origin(of_type) is Sequence
+    kind: Any
+    if not text:
+        kind = OneOf(names[1]) if names else str if of_type == Sequence[str] else click.Path(path_type=Path)
+        return click.argument(each.name, type=kind, metavar=each.name.upper() if names else None, nargs=-1 if several else 1,
+                              required=needed)
     flag = f"--{each.name.replace('_', '-')}"
-    if kind is bool:
-        return click.option(flag, each.name, is_flag=True, help=known["text"])
-    if known["of"] == STRUCTURES and kind is str:
-        kind = ACCEL
-    return click.option(flag, each.name, type=kind, default=each.default, show_default="[default" not in known["text"],
-                        help=known["text"])
+    if of_type is bool:
+        return click.option(flag, each.name, is_flag=True, help=text)
+    kind = Names() if several else ACCEL if names == STRUCTURES else TYPES[of_type]
+    return click.option(flag, each.name, type=kind, default=each.default, show_default="[default" not in text, help=text)
 
 
 def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of)."""
+    """Return the command that runs a plan's study."""
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)

@@ -13,8 +13,8 @@ import wrt
 from wrt.accel.bvh.wide import Bvh4, Bvh4Options
 from wrt.cli.common import load, say, shared
 from wrt.cli.reporting import measured
+from wrt.lab import STRUCTURES, Plan, option, the_meshes
 from wrt.lab.bench.report import Row, tabled
-from wrt.lab.plans import STRUCTURES, Plan, option, the_meshes
 
 TITLE = "Memory"
 LEGEND = "Bytes of the structure per triangle."

@@ -13,11 +13,26 @@ from tests.kernel_tools import floats, launch, zeros  # isort: skip (starts Warp
 import warp as wp
 
 from wrt.kernels.shade import elementary as functions
-from wrt.kernels.study.elementary import FUNCTIONS, call_functions
+from wrt.kernels.shade.elementary import acos, atan2, exp, power, sin_cos
+from wrt.kernels.structs import kernel
 
+FUNCTIONS = ("sin", "cos", "acos", "exp", "atan2", "power")
 BOUND = {"sin": 1.0, "cos": 1.0, "acos": 1.3, "exp": 1.1, "atan2": 1.7, "power": 1.3}  # ulp
 PRIME = 4099  # A stride through all bit patterns of float32.
 QUIET_NAN = 0x7FC00000
+
+
+@kernel
+def call_functions(x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+    """Store in out[i] the values of all FUNCTIONS, in their order, of x[i] or of (x[i], y[i])."""
+    i = wp.tid()
+    sin, cos = sin_cos(x[i])
+    out[i, 0] = sin
+    out[i, 1] = cos
+    out[i, 2] = acos(x[i])
+    out[i, 3] = exp(x[i])
+    out[i, 4] = atan2(x[i], y[i])
+    out[i, 5] = power(x[i], y[i])
 
 
 def called(x: object, y: object = 1.0) -> dict[str, np.ndarray]:

@@ -8,12 +8,13 @@ import pytest
 
 from tests import command_line
 from wrt.cli.measure import bench
-from wrt.lab import plans
-from wrt.lab.bench import report
-from wrt.lab.hard_cases import stability
+from wrt.lab.bench import Error, Pictures, Queries, Visibility, report
+from wrt.lab.claims import Claims
+from wrt.lab.hard_cases import Closed, Stability, stability
+from wrt.lab.mitsuba import Mitsuba
+from wrt.lab.rtcore import Float64, RtCore, WhatIf
 
-WITHOUT_FILES = (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Closed,
-                 plans.Claims)
+WITHOUT_FILES = (Queries, Visibility, Closed, Claims)
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return plans
 
 
-@pytest.mark.parametrize("plan", [each for each in vars(plans).values() if isinstance(each, type) and getattr(each, "QUICK", {})])
+@pytest.mark.parametrize("plan", [*WITHOUT_FILES, Error, Pictures, Stability, Mitsuba, Float64, RtCore, WhatIf])
 def test_quick_is_less_than_the_default(plan: Any) -> None:
     defaults = {name: plan.__dataclass_fields__[name].default for name in plan.QUICK}
     assert all(plan.QUICK[name] < default for name, default in defaults.items() if not isinstance(default, str | tuple))
@@ -38,19 +39,19 @@ def test_quick_is_less_than_the_default(plan: Any) -> None:
 
 def test_stability_quick_lists_its_smaller_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stability, "SPEED_RAYS", 2000)
-    done = command_line.wrt("stability", "E_grid", "--quick", "--rays", "20", "--sample", "20", "-q")
+    done = command_line.wrt("stability", "E_grid", "--quick", "--contestants", "bvh8", "--rays", "20", "--sample", "20", "-q")
     assert done.code == 0 and " 20 " in done.out
-    assert done.err == f"stability --quick: runs {plans.Stability.QUICK['runs']} instead of {plans.Stability.runs}\n"
+    assert done.err == f"stability --quick: runs {Stability.QUICK['runs']} instead of {Stability.runs}\n"
 
 
-@pytest.mark.parametrize("words", [("units", "--quick"), ("--quick", "units")])
+@pytest.mark.parametrize("words", [("visibility", "--quick"), ("--quick", "visibility")])
 def test_a_bench_keeps_stated_options_and_uses_smaller_defaults(measured: list[Any], words: tuple[str, ...]) -> None:
     done = command_line.wrt("bench", *words, "--runs", "4", "-q")
     assert done.code == 0, done.err
-    assert measured == [plans.Units(**plans.Units.QUICK | {"runs": 4})]
-    rays = plans.Units.QUICK["rays"]
-    assert done.err == f"units --quick: rays {rays} instead of {plans.Units.rays}\n"
-    assert f"--rays {rays} --runs 4" in done.out  # the command that repeats the measurement
+    assert measured == [Visibility(**Visibility.QUICK | {"runs": 4})]
+    size = Visibility.QUICK["size"]
+    assert done.err.startswith(f"visibility --quick: size {size} instead of {Visibility.size}, ")
+    assert f"--size {size} " in done.out and "--runs 4" in done.out  # the command that repeats the measurement
 
 
 def test_without_a_name_all_benches_run_that_need_no_file(measured: list[Any]) -> None:
@@ -65,4 +66,4 @@ def test_without_a_name_all_benches_run_that_need_no_file(measured: list[Any]) -
 
 def test_without_quick_a_bench_needs_a_name(measured: list[Any]) -> None:
     assert command_line.wrt("bench").code == 2 and not measured
-    assert command_line.wrt("bench", "units", "-q").err == "" and measured == [plans.Units()]
+    assert command_line.wrt("bench", "visibility", "-q").err == "" and measured == [Visibility()]

@@ -17,8 +17,8 @@ from click.testing import CliRunner
 
 from wrt.cli.reporting import measured
 from wrt.core.interrupts import Interrupted
+from wrt.lab import Plan, option
 from wrt.lab.bench.report import Columns, Groups, Row
-from wrt.lab.plans import Plan, option
 
 TITLE, LEGEND = "Squares", "square: the number times itself."
 COLUMNS: Columns = {"number": "{number}", "square": "{square}"}

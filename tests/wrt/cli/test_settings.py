@@ -193,7 +193,7 @@ def test_help_shows_the_names_of_each_table() -> None:
     assert len(accels) > 5 and all(each.type is ACCEL for each in accels)
 
 
-@pytest.mark.parametrize("arguments", ["--help", "render --help", "bench --help", "bench units --help", "rendr"])
+@pytest.mark.parametrize("arguments", ["--help", "render --help", "bench --help", "bench queries --help", "rendr"])
 def test_help_does_not_wait_for_warp(arguments: str) -> None:
     code = ("import sys\nfrom wrt.cli.main import cli\ntry:\n    cli()\nfinally:\n"
             "    print({name.split('.')[0] for name in sys.modules} & {'warp', 'scipy', 'trimesh', 'rich'})")

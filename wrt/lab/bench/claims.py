@@ -9,10 +9,10 @@ import numpy as np
 
 from wrt.lab.bench.plot import new_figure, picture_file
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, tabled
+from wrt.lab.claims import Claims as Plan
 from wrt.lab.claims.claim import CLAIMS, SAME_SCENE, Figure, Study
 from wrt.lab.claims.nodes import NAMES, WIDTHS
 from wrt.lab.claims.scene_files import scene_files
-from wrt.lab.plans import Claims as Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

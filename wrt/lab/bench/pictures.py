@@ -11,9 +11,9 @@ import numpy as np
 from wrt.core.checks import as_size
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
+from wrt.lab.bench import Pictures as Plan
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells
 from wrt.lab.bench.timing import alternate, spread
-from wrt.lab.plans import Pictures as Plan
 from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of, render_kernel

@@ -1,4 +1,4 @@
-"""Sets of rays that measure structures: primary, shadow and diffuse rays of a picture, and incoherent random rays."""
+"""Sets of rays that measure structures: primary, shadow and diffuse rays of a picture, incoherent rays, points, and many small pictures."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,24 +11,29 @@ from wrt.accel.queries.answers import Counters
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
 TAN_HALF_FOV = 0.55  # a field of view of 58 degrees
+POINTS_OF_RAYS = 50  # rays for each point: trimesh takes milliseconds a point
+TILE = 64  # pixels of a side of a picture in a small world
 OFFSET = 1e-4  # start of shadow and diffuse rays above the surface, over the radius of the mesh's bounding sphere
 
 
 @dataclass(frozen=True, eq=False)
 class RaySet:
-    """Rays of one kind. origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: trace for any hit (shadow rays)."""
+    """Rays of one kind. origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: trace for any hit (shadow rays).
+    world: (N,) int32, the world of each ray, or None. The kind "points" has points in `origins`, and no directions."""
 
     kind: str
     origins: np.ndarray
     directions: np.ndarray
     t_max: np.ndarray
     any_hit: bool = False
+    world: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.origins)
 
     def part(self, rows: slice | np.ndarray) -> "RaySet":
-        return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
+        return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit,
+                      None if self.world is None else self.world[rows])
 
 
 def counters_of(accel: Accelerator, rays: Any, trace: bool = False) -> Counters:
@@ -79,6 +84,38 @@ def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) 
     """Return n rays between random points on the mesh's bounding sphere; their lines are uniformly distributed."""
     a, b = (center + radius * unit(rng.normal(size=(n, 3))) for _ in range(2))
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
+
+
+def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
+    """Return n rays along uniformly distributed lines that meet the geometry's box. They start on its bounding sphere and go inwards."""
+    lo, hi, center, radius = ball_around(geometry)
+    rng = np.random.default_rng(seed)
+    origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+    while len(origins) < n:
+        normal = unit(rng.normal(size=(n, 3)))
+        o, d = (center + radius * normal).astype(np.float32), unit(unit(rng.normal(size=(n, 3))) - normal).astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.sort([(lo - o) / d, (hi - o) / d], axis=0)
+        meets = t[0].max(axis=1) <= t[1].min(axis=1)
+        origins, directions = np.concatenate([origins, o[meets]]), np.concatenate([directions, d[meets]])
+    return RaySet("inward", origins[:n], directions[:n], endless(n))
+
+
+def points_around(geometry: Geometry, rays: int, seed: int) -> RaySet:
+    """Return a point for each POINTS_OF_RAYS of so many rays, in the box of the geometry, enlarged by a half."""
+    low, high, center, _ = ball_around(geometry)
+    shape = max(rays // POINTS_OF_RAYS, 1), 3
+    points = (center + 0.75 * (high - low) * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)).astype(np.float32)
+    return RaySet("points", points, np.zeros_like(points), endless(len(points)))
+
+
+def tiles(worlds: int) -> RaySet:
+    """Return the rays of a camera that looks down on the middle of each world: TILE x TILE pixels, world by world."""
+    x, y = np.meshgrid(*[(np.arange(TILE) + 0.5) / TILE * 2.0 - 1.0] * 2)
+    one = unit(np.stack([0.5 * x, -0.5 * y - 0.5, np.full_like(x, -1.0)], axis=-1).reshape(-1, 3)).astype(np.float32)
+    n = worlds * len(one)
+    return RaySet("tiles", np.tile(np.array([0.0, 2.5, 4.0], np.float32), (n, 1)), np.tile(one, (worlds, 1)), endless(n),
+                  world=np.repeat(np.arange(worlds, dtype=np.int32), len(one)))
 
 
 def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:

@@ -19,7 +19,7 @@ import wrt
 from wrt.core.device import describe_devices
 from wrt.core.tables import Rows, html_table
 from wrt.core.types import JsonObject
-from wrt.lab.plans import Plan
+from wrt.lab import Plan
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
@@ -162,10 +162,10 @@ def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
     return f"{head}{markdown(parts_of(rows, plan))}\n{study.LEGEND}"
 
 
-def without_folder(text: str) -> str:
-    """Return "name=file" without the file's folder, and other texts unchanged."""
-    name, given, path = text.partition("=")
-    return f"{name}={Path(path).name}" if given else text
+def short(thing: object) -> str:
+    """Return the name of a mesh, a file without its folder, "name=file" without the file's folder, or another text."""
+    name, sign, path = thing.partition("=") if isinstance(thing, str) else ("", "", "")
+    return f"{name}={mesh_name(path)}" if sign else mesh_name(thing)
 
 
 def repeating(plan: Plan) -> str:
@@ -173,14 +173,13 @@ def repeating(plan: Plan) -> str:
     words = [f"python -m wrt {plan.COMMAND}"]
     for each in fields(plan):
         value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
+        several = isinstance(value, Sequence) and not isinstance(value, str)
         if not each.metadata["text"]:
-            things = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
-            words += map(mesh_name, things)
+            words += map(short, value if several else (value,))
         elif isinstance(value, bool):
             words += [flag] if value else []
         elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
-            text = ",".join(map(without_folder, value)) if isinstance(value, Sequence) and not isinstance(value, str) else value
-            words.append(f"{flag} {text.name if isinstance(text, Path) else text}")
+            words.append(f"{flag} {','.join(map(short, value)) if several else value}")
     return " ".join(words)
 
 

@@ -3,20 +3,24 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.core.threads import thread_count
+from wrt.core.device import launch_on, load_kernel, start, upload
+from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
+from wrt.kernels.study.rasterize import rasterize
+from wrt.lab.bench import Visibility as Plan
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.timing import alternate, spread
-from wrt.lab.bench.visibility_check import agreement
-from wrt.lab.plans import Visibility as Plan
+from wrt.renderer.pixel_rays import camera_rays
+from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
 from wrt.scene.materials import Material
@@ -24,48 +28,67 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
+Picture = tuple[np.ndarray, np.ndarray]  # depth along the ray (inf on a miss), and prim_id (-1): (pixels,) each
+NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # key of a pixel without a triangle: depth inf, prim_id -1
+SAME_DEPTH = 1e-5  # largest relative difference of depth at which two triangles are a tie
 MIN_SIDE = 64  # pixels; the sweep over picture sizes starts here and doubles the side
 SWEEP_TRIANGLES = 80_000  # about the triangles of the mesh in the sweep over picture sizes
-MAX_BUILDS = 3
 SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions of an icosphere; cells a side of a terrain
 TITLE = "Rasterising against ray casting"
 COLUMNS: Columns = {
     "surface": lambda row: Path(row.surface).name, "triangles": "{triangles}", "pixels": "{pixels}",
-    "covered": lambda row: f"{row.agreement.covered / row.agreement.pixels:.1%}", "raster ms": lambda row: spread(row.raster, 1e3),
-    "cast ms": lambda row: spread(row.cast, 1e3), "build ms": lambda row: f"{1e3 * row.build_median:.3g}",
-    "cast / raster": lambda row: spread(np.array(row.cast) / np.array(row.raster)),
-    "(cast + build) / raster": "{cast_and_build_over_raster:.3g}",
-    "differ": "{agreement.differ}", "ties": "{agreement.ties}", "silhouettes": "{agreement.silhouettes}",
-    "unexplained": "{agreement.unexplained}", "depth error": "{agreement.depth_error:.1e}",
-    "error / bound": "{agreement.depth_share:.2f}"}
-EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}",
-                      "exponent": "{exponent:.3f} ± {error:.3f}", "last exponent": "{last:.3f}"}
-LEGEND = """\
+    "covered": lambda row: f"{row.covered / row.pixels:.1%}", "raster ms": lambda row: spread(row.raster, 1e3),
+    "cast ms": lambda row: spread(row.cast, 1e3), "build ms": lambda row: f"{1e3 * row.build:.3g}",
+    "cast / raster": lambda row: spread(np.array(row.cast) / np.array(row.raster)), "differ": "{differ}", "ties": "{ties}"}
+EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}", "exponent": "{exponent:.3f}"}
+LEGEND = f"""\
 covered: pixels with a triangle. raster: time of a z-buffer over all triangles. cast: time of one ray a pixel; rays and structure are made
-beforehand. build: time to build that structure. Medians of alternating runs, quartiles in brackets, ratios run by run. cast / raster:
-above 1 rasterising is faster. (cast + build) / raster: the structure serves one picture only. differ: pixels whose prim_id differs, the
-sum of the next three. ties: depths agree within their bound (common edges, coincident triangles). silhouettes: the rays' answer is exact
-at a point within a rounding error, some 1e-4 pixels, of the centre. unexplained: must be 0. depth error: largest relative difference
-where prim_id agrees. error / bound: its share of the derived bound (at most 1)."""
+beforehand. build: time to build that structure. Both on one thread of a CPU. Medians of alternating runs, quartiles in brackets, ratios
+run by run. cast / raster: above 1 rasterising is faster. differ: pixels whose prim_id differs. ties: pixels among them at the same depth,
+within {SAME_DEPTH:g} relative; at the others the centre lies on an outline, within a rounding error. exponent: seconds ~ n^exponent."""
 
 
-def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float], agreement: Row, **subject: object) -> Row:
-    """Return the row of one mesh in one picture. raster, cast, build: seconds of each run; subject: further fields of the row."""
-    ratio = [np.median((np.array(cast) + extra) / np.array(raster)) for extra in (0.0, np.median(build))]
-    return Row(**subject, raster=list(raster), cast=list(cast), build=list(build), agreement=agreement,
-               raster_median=float(np.median(raster)), cast_median=float(np.median(cast)), build_median=float(np.median(build)),
-               cast_over_raster=float(ratio[0]), cast_and_build_over_raster=float(ratio[1]))
+def rasterizer(geometry: Geometry, camera: Camera, side: int, device: str = "cpu") -> Callable[[], Picture]:
+    """Return a function that draws the triangles with a z-buffer: `side` x `side` pixels, seen from the centre of the lens."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"is {camera.kind}; the rasterizer needs a perspective camera", place=f"camera {camera.name!r}")
+    place, c = start(device), camera_struct(camera, (side, side))
+    right, up, forward = (np.array(list(axis), np.float64) for axis in (c.right, c.up, c.forward))
+    tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # as in the float32 camera of the rays
+    from_pixels = np.column_stack([2.0 * tan_x / side * right, -2.0 * tan_y / side * up, forward - tan_x * right + tan_y * up])
+    inputs = [wp.vec3d(*list(c.origin)), wp.mat33d(np.linalg.inv(from_pixels)), wp.mat33d(from_pixels), wp.vec2i(side, side),
+              upload(geometry.vertices, wp.vec3, place), upload(geometry.faces, wp.vec3i, place)]
+    keys = wp.empty(side * side, dtype=wp.uint64, device=place)
+    load_kernel(rasterize, place)
+
+    def draw() -> Picture:
+        keys.fill_(NOTHING)
+        launch_on(place, rasterize, len(geometry.faces), *inputs, keys)
+        halves = keys.numpy().astype("<u8", copy=False).view("<u4").reshape(-1, 2)
+        return halves[:, 1].view(np.float32), halves[:, 0].view(np.int32)
+
+    return draw
 
 
-def terrain(cells: int) -> Mesh:
-    """Return hills of a fixed shape over the square [-1, 1]^2 in x and z, with `2 * cells**2` triangles."""
-    x, z = np.meshgrid(np.linspace(-1.0, 1.0, cells + 1), np.linspace(-1.0, 1.0, cells + 1), indexing="ij")
-    y = sum(0.3 / k * np.sin(k * (2.1 * x + 0.7 * z) + k * k) * np.cos(k * (1.9 * z - 0.6 * x) + 2.0 * k) for k in (1, 2, 4, 8))
-    i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
-    corner = (i * (cells + 1) + j).reshape(-1)
-    a, b, c, d = corner, corner + 1, corner + cells + 2, corner + cells + 1
-    faces = np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3)
-    return Mesh(np.stack([x, y, z], axis=-1).reshape(-1, 3), faces, name="terrain")
+def ray_caster(geometry: Geometry, camera: Camera, side: int, accel: str = "bvh",
+               device: str = "cpu") -> tuple[Callable[[], Picture], float]:
+    """Return a function that casts a ray through the centre of each pixel, and the seconds to build its structure."""
+    structure = build(geometry, accel, device)
+    origins, directions = (wp.array(rows, dtype=wp.vec3, device=structure.device) for rows in camera_rays(camera, (side, side)))
+
+    def draw() -> Picture:
+        hits = structure.closest_hit(origins, directions, threads=1)
+        return hits.t.numpy(), hits.prim_id.numpy()
+
+    return draw, structure.stats.build_seconds
+
+
+def compared(raster: Picture, cast: Picture) -> dict[str, int]:
+    """Count pixels: covered by a triangle, with another prim_id in the two pictures, and of the latter those at the same depth."""
+    differ = raster[1] != cast[1]
+    with np.errstate(invalid="ignore"):  # inf - inf, of two misses
+        close = np.abs(raster[0] - cast[0]) <= SAME_DEPTH * cast[0]
+    return {"covered": int((raster[1] >= 0).sum()), "differ": int(differ.sum()), "ties": int((differ & close & np.isfinite(cast[0])).sum())}
 
 
 def subdivided(mesh: Mesh) -> Mesh:
@@ -109,74 +132,38 @@ def groups(plan: Plan) -> Groups:
     for surface in surfaces(plan):
         swept = min(surface.meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
         for mesh in surface.meshes:
-            made = cache(partial(ready, plan, surface, mesh))
             for sweep, side in [("triangles", plan.size), *(("pixels", side) for side in sides if mesh is swept)]:
-                yield partial(picture_rows, made, sweep, side)
+                yield partial(picture_rows, plan, surface, mesh, sweep, side)
 
 
-def picture_rows(made: Callable[[], Callable[[str, int], Row]], sweep: str, side: int) -> list[Row]:
-    return [made()(sweep, side)]
-
-
-def ready(plan: Plan, surface: Surface, mesh: Mesh) -> Callable[[str, int], Row]:
-    """Prepare one mesh for both methods. Return a function (sweep, side) -> row that measures a picture of `side` x `side` pixels."""
+def picture_rows(plan: Plan, surface: Surface, mesh: Mesh, sweep: str, side: int) -> list[Row]:
     geometry = Geometry.of(mesh)
-    rasterizer = Rasterizer(geometry, plan.device, plan.threads)
-    caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
-    again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
-    builds = [accel.stats.build_seconds for accel in (caster.accel, *again)]
-
-    def measure(sweep: str, side: int) -> Row:
-        size = (side, side)
-        seconds = alternate({drawer: partial(drawer.draw, surface.camera, size) for drawer in (rasterizer, caster)}, plan.runs)
-        checked = agreement(rasterizer, caster, geometry, surface.camera, size)
-        return row_of(seconds[rasterizer].tolist(), seconds[caster].tolist(), builds, checked, sweep=sweep, surface=surface.name,
-                      triangles=len(geometry.faces), pixels=side * side)
-
-    return measure
+    raster = rasterizer(geometry, surface.camera, side, plan.device)
+    cast, build_seconds = ray_caster(geometry, surface.camera, side, plan.accel, plan.device)
+    seconds = alternate({"raster": raster, "cast": cast}, plan.runs)
+    return [Row(sweep=sweep, surface=surface.name, triangles=len(mesh.faces), pixels=side * side, build=build_seconds,
+                **{name: each.tolist() for name, each in seconds.items()}, **compared(raster(), cast()))]
 
 
-def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
-    """Fit seconds ~ n^exponent by least squares on logarithms.
-    error: standard deviation of the exponent (NaN for two points); last: exponent between the last two points."""
-    from scipy.stats import linregress
-
-    x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
-    if len(x) < 2:
-        raise ValueError("an exponent needs two points")
-    line = linregress(x, y)
-    return {"exponent": float(line.slope), "error": float(line.stderr) if len(x) > 2 else math.nan,
-            "last": float((y[-1] - y[-2]) / (x[-1] - x[-2]))}
-
-
-def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Group rows by (sweep, surface); sort each group by the quantity that the sweep varies."""
-    return {(sweep, surface): sorted(group, key=lambda row: getattr(row, sweep))
-            for (sweep, surface), group in grouped(rows, "sweep", "surface").items()}
-
-
-def fits(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """Return the exponents of rasterising and casting in each sweep with two or more points; over triangles, also those of building."""
-    return [{"sweep": sweep, "surface": surface, "cost": cost,
-             **fit([getattr(row, sweep) for row in group], [getattr(row, f"{cost}_median") for row in group])}
-            for (sweep, surface), group in series(rows).items() if len(group) > 1
-            for cost in (("raster", "cast", "build") if sweep == "triangles" else ("raster", "cast"))]
+def exponents(rows: Sequence[Row]) -> list[Row]:
+    """Fit seconds ~ n^exponent by least squares on logarithms, in each sweep with two or more points."""
+    out = []
+    for (sweep, surface), group in grouped(rows, "sweep", "surface").items():
+        for cost in ("raster", "cast", "build") if len(group) > 1 else ():
+            seconds = [np.median(getattr(row, cost)) for row in group]
+            slope = np.polyfit(np.log([getattr(row, sweep) for row in group]), np.log(seconds), 1)[0]
+            out.append(Row(sweep=sweep, surface=surface, cost=cost, exponent=float(slope)))
+    return out
 
 
 def machine(plan: Plan) -> str:
-    threads = f"{thread_count(plan.threads)} threads used" if plan.device == "cpu" else ""
-    return machine_line(threads, f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
+    return machine_line("one thread used" if plan.device == "cpu" else "", f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    out = []
-    for sweep in ("triangles", "pixels"):
-        lines = [row for key, group in series(rows).items() if key[0] == sweep for row in group]
-        out += [tabled(COLUMNS, lines, f"As {sweep} grow")] if lines else []
-    found = [Row(**each) for each in fits(rows)]
-    note = "seconds ~ n^exponent over the whole sweep (± one standard deviation). last exponent: between the last two points alone."
-    return [*out, *([tabled(EXPONENTS, found, "Exponents", note)] if found else [])]
+    tables = [tabled(COLUMNS, group, f"As {sweep} grow") for (sweep,), group in grouped(rows, "sweep").items()]
+    return [*tables, tabled(EXPONENTS, exponents(rows), "Exponents")]
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
-    return {"exponents": fits(rows)}
+    return {"exponents": [row.as_dict() for row in exponents(rows)]}

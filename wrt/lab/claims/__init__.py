@@ -1,1 +1,21 @@
 """Published claims about ray tracing hardware, repeated with exact counts: `python -m wrt bench claims`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from wrt.lab import Plan, option
+
+
+@dataclass(frozen=True)
+class Claims(Plan):
+    """Repeat published claims about ray tracing hardware. By exact counts: the published number, wrt's, their ratio, and what differs.
+
+    NAMES: claims; default: all. Without files, generated scenes stand in for the published ones."""
+
+    COMMAND, STUDY = "bench claims", "wrt.lab.bench.claims"
+    QUICK = {"side": 48, "names": ("ttp-nodes", "rules", "coop-rt", "cwbvh", "short-stack")}
+    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv or .json, or charts as .svg or .png"
+    names: Sequence[str] = option((), of=("claim", "wrt.lab.claims.claim:CLAIMS"))
+    scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE,conference=FILE",
+                                  check="wrt.lab.claims.scene_files:scene_files")
+    side: int = option(128, "Side of the square pictures, in pixels", (8, 1024))

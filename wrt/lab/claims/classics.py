@@ -8,8 +8,8 @@ from wrt.accel.cells.kdtree import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.kdtree import LEAF
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import counters_of
-from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims.claim import SAME_SCENE, Claim, Figure, Study
 from wrt.scene.shapes import icosphere
 

@@ -11,8 +11,8 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.core.types import PathLike
 from wrt.io.mesh_file import as_mesh
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import OFFSET, ball_around, through_pixels, unit
-from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims.walks import Rays
 from wrt.lab.rtcore.warps import WARP, blocks
 from wrt.scene.mesh import Mesh

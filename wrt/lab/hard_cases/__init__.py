@@ -1,1 +1,41 @@
-"""Rays on which intersection tests fail, and tests of wrt and other libraries with them."""
+"""Rays on which intersection tests fail, and judgement by exact arithmetic."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wrt.lab import Plan, option, the_meshes, the_seed
+
+
+@dataclass(frozen=True)
+class Stability(Plan):
+    """Run the hard cases on intersection tests and ray libraries. Count wrong rays, and measure errors and speed.
+
+    CASES: names such as E_grid, or letters of groups such as E; default: all."""
+
+    COMMAND, STUDY, QUICK = "stability", "wrt.lab.hard_cases.stability", {"rays": 300, "runs": 3}
+    cases: Sequence[str] = option((), check="wrt.lab.hard_cases.cases:chosen")
+    contestants: Sequence[str] = option((), "Contestants, as in `bench queries`  [default: bvh8 with every triangle and box test]",
+                                        check="wrt.lab.bench.contestants:check_names")
+    peers: bool = option(False, "Also test the installed libraries: Embree (robust and fast), Warp, Open3D, Mitsuba")
+    rays: int = option(10_000, "Number of rays of each case for the first contestant", (1, 2**40))
+    sample: int = option(10_000, "Number of these rays that the oracle judges, and that the other contestants trace", (1, 2**40))
+    seed: int = the_seed()
+    threads: int | None = option(None, "Number of CPU threads for the rays beyond the sample  [default: all cores]",
+                                 check="wrt.core.threads:thread_count")
+    runs: int = option(7, "Timed runs of each contestant, alternating", (1, 1000))
+
+
+@dataclass(frozen=True)
+class Closed(Plan):
+    """Test which points are inside of closed meshes. Rays through corners and edges must cross an even number of times.
+    Open3D and trimesh answer too, if installed.
+
+    MESHES: closed mesh files, in addition to seven built-in meshes."""
+
+    COMMAND, STUDY, QUICK = "bench closed", "wrt.lab.hard_cases.crossings", {"points": 1000, "rays": 1000, "others": 1000}
+    meshes: Sequence[Any] = the_meshes()
+    points: int = option(10_000, "Number of points for each mesh", (1, 2**28))
+    rays: int = option(10_000, "Number of rays for each mesh", (1, 2**28))
+    others: int = option(10_000, "Most points and rays for another library (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
+    seed: int = option(0, "Seed of the random points and rays")

@@ -1,14 +1,11 @@
-"""`python -m wrt stability`: run the hard cases on the intersection tests, and measure errors and speed."""
+"""`python -m wrt stability`: run the hard cases on intersection tests and ray libraries, and measure errors and speed."""
 
-import signal
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, partial
-from itertools import product
 
 import numpy as np
 import warp as wp
@@ -18,127 +15,125 @@ from wrt.accel.structure import Structure
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import JsonObject, Kernel
+from wrt.core.types import Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
-from wrt.lab.bench.report import Columns
-from wrt.lab.bench.report import Row as Line
-from wrt.lab.bench.timing import alternate, quartiles
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
+from wrt.lab.bench.contestants import Contestant, Own, contestant, installed
+from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, grouped, machine_line, tabled, versions
+from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.hard_cases import Stability as Plan
 from wrt.lab.hard_cases.cases import UNKNOWN, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
-from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
-from wrt.lab.plans import Stability as Plan
-from wrt.renderer.progress import TimeLeft
+from wrt.scene.mesh import Mesh
 
+DEFAULT = "bvh8"
+TESTS = (DEFAULT, *(f"{DEFAULT}:triangle={name}" for name in list(RAY_TRIANGLE)[1:]),
+         *(f"{DEFAULT}:box={name}" for name in list(RAY_AABB)[1:]))
+PEERS = ("embree", "embree:mode=fast", "warp", "open3d", "mitsuba")
 ALL_HITS_TESTS = 20_000_000  # most ray-primitive tests of a case's all-hits check
 ALL_HITS_RAYS = 2000  # rays of the all-hits check
 SPEED_RAYS = 200_000
-COMPARED = 2000  # hits of a case that the oracle compares with the closest hit, except for the default algorithm
+COMPARED = 2000  # hits of a case that the oracle compares with the closest hit, except for the first contestant
 CHUNK = 2**18  # rays beyond the sample at once
-
+TITLE = "Stability of intersection tests"
+WRONG: Columns = {"misses": "{v.misses}", "false hits": "{v.false_hits}", "wrong prim": "{v.wrong_prim}", "self-hits": "{v.self_hits}"}
+ERRORS: Columns = {"t ulp max": "{v.t.largest:.3g}", "t ulp 99.9 %": "{v.t.p999:.3g}", "t / bound": "{v.t.largest_ratio:.2g}"}
 COLUMNS: Columns = {
-    "case": "{case}", "algorithm": "{algorithm}",
-    "rays": lambda row: {None: str(row.verdict.rays), True: "refused", False: "ACCEPTED"}[row.refused],
-    **{head: partial(lambda form, row: form.format_map(vars(row)) if row.refused is None else "", form) for head, form in {
-        "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}", "wrong prim": "{verdict.wrong_prim}",
-        "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}", "ties": "{verdict.ties}",
-        "near ties": "{verdict.near_ties}", "borderline": "{verdict.borderline}", "t ulp max": "{verdict.t.largest:.3g}",
-        "t ulp 99.9 %": "{verdict.t.p999:.3g}", "t / bound": "{verdict.t.largest_ratio:.2g}"}.items()}}
+    "case": "{case}", "contestant": "{name}", "rays": lambda row: row.note or str(row.v.rays),
+    **{head: partial(lambda form, row: "" if row.note else form.format_map(vars(row)), form) for head, form in {
+        "judged": "{judged}", **WRONG, "duplicates": "{v.duplicate_hits}", "ties": "{v.ties}", "near ties": "{v.near_ties}",
+        "borderline": "{v.borderline}", **ERRORS}.items()}}
+ALL: Columns = {
+    "contestant": "{name}", "rays": "{v.rays}", **WRONG, "t over bound": "{v.t.over}", "errors": "{errors}",
+    "wrong per million": lambda row: f"{1e6 * wrong(row.v) / max(row.v.rays, 1):.3g}", "typical t ulp": "{typical:.3g}",
+    "Mray/s": lambda row: spread(row.mrays), "speed / first": lambda row: spread(row.ratios), "B/triangle": "{bytes_per_triangle:.0f}"}
+LEGEND = f"""\
+judged: the first rays of a case (--sample), which the oracle judges. For further rays the right answer is known in advance: a closed
+surface must be hit, a triangle with collinear corners must not be hit, and a ray must not hit the triangle on which it starts. misses:
+lost rays. false hits: reported hits of a primitive that the ray misses. wrong prim: a nearer primitive exists. All three by more than the
+derived error bound. The next three are within the bound, so not wrong. ties: equal exact t. near ties: the bound hides which primitive is
+nearer, counted for all hits of the first contestant and for {COMPARED} hits a case of the others. borderline: the exact ray passes an edge
+by less than the bound. duplicates: an all-hits query reports one crossing of a surface twice. t ulp: error of t in float32 steps at the
+exact t. t / bound: largest error of t over the bound of wrt's watertight test. typical t ulp: median over the cases of the 99.9th
+percentile. errors: cases of finite input in which the contestant raised an error. Input that is not finite may be refused. Mray/s: one
+thread, case A's sphere of 159,200 triangles, median [quartiles] of alternating runs."""
 
 
-@dataclass
-class CaseRow:
-    """Result of one case and algorithm. judged: rays that the oracle judged; refused: None for finite input, True if refused."""
-
-    case: str
-    algorithm: str
-    verdict: Verdict = field(default_factory=Verdict)
-    judged: int = 0
-    refused: bool | None = None
-
-    def as_dict(self) -> JsonObject:
-        return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
+def contestants(plan: Plan) -> list[Contestant]:
+    """Return the contestants: by default wrt's intersection tests, the default tests first."""
+    return [contestant(name) for name in dict.fromkeys([*(plan.contestants or TESTS), *(installed(PEERS) if plan.peers else ())])]
 
 
-class Result(Line):
-    """Results of `run`. rows: a CaseRow for each case and algorithm; speed: algorithm -> result of `measure_speed`.
-    - not_installed: names of missing libraries; undone: names of unfinished cases; interrupted: number of the signal that ended the run."""
+def groups(plan: Plan) -> Groups:
+    """Yield the group with each contestant's speed, then a group for each case and contestant."""
+    all_of_them = contestants(plan)
+    yield partial(speed_rows, all_of_them, plan.runs)
+    for name in chosen(plan.cases):
+        for one in all_of_them:
+            yield partial(case_rows, plan, name, one, one is all_of_them[0])
 
 
-def run(plan: Plan, report: Callable[[CaseRow], None] = lambda row: None, progress: Callable[[str], None] = lambda line: None) -> Result:
-    """Run every chosen case with every algorithm, on the same rays.
-
-    report: receives each finished row; progress: receives lines of text from any thread.
-    After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished. Raise InputError for an unknown case."""
-    begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
-    progress("measuring the speed")
-    found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
-                   not_installed=[peer.name for peer in PEERS.values() if plan.peers and not peer.is_installed()])
-    left = TimeLeft(len(names) * len(algorithms))
-    try:
-        for name, algorithm in product(names, algorithms):
-            progress(f"{left.done:.0f} of {left.total} rows are done; now {name}, {algorithm.name}{left}")
-            row = run_case(name, fewer(name, min(plan.sample, plan.rays)), algorithm, plan.seed)
-            if row is not None and algorithm is algorithms[0] and row.refused is None:
-                row.verdict = sum(judge_further(name, plan, progress), row.verdict)
-            left.done += 1
-            if row is not None:
-                found.rows.append(row)
-                report(row)
-    except KeyboardInterrupt as stop:
-        if not found.rows:
-            raise
-        found.interrupted = int(getattr(stop, "number", signal.SIGINT))
-        last = found.rows[-1]
-        found.undone = names[names.index(last.case) + (last.algorithm == algorithms[-1].name):]
-    found.seconds = time.perf_counter() - begin
-    return found
+def speed_rows(all_of_them: Sequence[Contestant], runs: int) -> list[Row]:
+    """Measure all contestants on one thread in alternating runs, on case A's sphere of 159,200 triangles."""
+    case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
+    for one in all_of_them:
+        one.prepare(case.geometry)
+    seconds = alternate({one.name: partial(one.closest, case.origins, case.directions) for one in all_of_them}, runs)
+    return [Row(name=one.name, mrays=(SPEED_RAYS / seconds[one.name] / 1e6).tolist(), bytes_per_triangle=one.bytes_per_triangle,
+                ratios=(seconds[all_of_them[0].name] / seconds[one.name]).tolist()) for one in all_of_them]
 
 
-def all_algorithms(plan: Plan) -> list[Algorithm]:
-    """Return wrt's intersection tests, the default first. If plan.peers is True, also return the installed other libraries."""
-    return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
+def case_rows(plan: Plan, name: str, one: Contestant, first: bool) -> list[Row]:
+    """Run one case; return its row, or no row if the contestant does not support the case. first: judge further rays, too."""
+    row = run_case(name, fewer(name, min(plan.sample, plan.rays)), one, plan.seed, None if first else COMPARED)
+    if row is None:
+        return []
+    if first and isinstance(one, Own) and not row.note:
+        row.v = sum(judge_further(name, plan, one), row.v)
+    return [row]
 
 
-def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> CaseRow | None:
-    """Run one case, let the oracle judge it, and return its row, or None if the algorithm does not support the case.
-    Peers support only triangles, finite input and t_min = 0."""
-    row = CaseRow(name, algorithm.name)
+def run_case(name: str, rays: int, one: Contestant, seed: int = 0, compared: int | None = COMPARED) -> Row | None:
+    """Run one case, let the oracle judge it, and return its row, or None if the contestant does not support the case: another library
+    supports only triangles and t_min = 0. compared: as for `judge`."""
+    row, own = Row(case=name, name=one.name, v=Verdict(), judged=0, note=""), isinstance(one, Own)
     for case in chunks(name, rays, seed):
-        if case.refused:
-            if algorithm.is_peer:
-                return None
-            row.refused = row.refused is not False and _is_refused(case, algorithm)
+        if case.refused and own:
+            row.note = "refused" if _is_refused(case, one) else "ACCEPTED"
             continue
-        if (algorithm.is_peer and case.t_min.any()) or not algorithm.prepare(case.geometry):
-            return None
-        hits = algorithm.closest(case.origins, case.directions, case.t_min, case.t_max)
-        is_default = algorithm.name == Own().name
-        row.verdict += judge(case, hits, None if is_default else min(COMPARED, case.compared), lowest=not algorithm.is_peer)
+        try:
+            if (case.t_min.any() and not own) or not one.prepare(case.geometry):
+                return None
+            with np.errstate(all="ignore"):  # of rays that are not finite
+                hits = one.closest(case.origins, case.directions, case.t_min, case.t_max)
+        except Exception as error:
+            if own:
+                raise
+            row.note = "refused" if case.refused else f"{type(error).__name__}: {error}".splitlines()[0][:100]
+            return row
+        row.v += judge(case, hits, None if compared is None else min(compared, case.compared), lowest=own)
         row.judged += len(case)
-        if isinstance(algorithm, Own):
+        if isinstance(one, Own):
             if case.next_directions is not None:
-                row.verdict += judge_next(case, *respawn(algorithm, case))
+                row.v += judge_next(case, *respawn(one, case))
             if not len(case.geometry.spheres) and len(case.geometry) * ALL_HITS_RAYS <= ALL_HITS_TESTS:
-                row.verdict += _judge_all(algorithm, case)
+                row.v += _judge_all(one, case)
     return row
 
 
-def judge_further(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
-    """Yield verdicts, without the oracle, on the rays beyond the sample, traced by the default algorithm on all threads."""
-    left, begin = fewer(name, plan.rays) - fewer(name, plan.sample), time.perf_counter()
+def judge_further(name: str, plan: Plan, one: Own) -> Iterator[Verdict]:
+    """Yield verdicts, without the oracle, on the rays beyond the sample, traced by `one` on all threads."""
     own = threading.local()  # each thread has its own structure
 
     def part(index: int) -> Verdict:
-        own.default = getattr(own, "default", None) or Own()
-        return further_chunk(name, plan, index, own.default)
+        own.copy = getattr(own, "copy", None) or type(one)(one.NAME, **one.options)
+        return further_chunk(name, plan, index, own.copy)
 
     pool = ThreadPoolExecutor(thread_count(plan.threads))
     try:
-        for i, verdict in enumerate(pool.map(part, range(n_chunks(name, plan))), 1):
-            done = min(CHUNK * i, left) / 1e6
-            progress(f"{name}, {done:.1f} of {left / 1e6:.1f} M further rays, {done / (time.perf_counter() - begin):.2f} Mray/s")
-            yield verdict
+        yield from pool.map(part, range(n_chunks(name, plan)))
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -152,9 +147,8 @@ def n_chunks(name: str, plan: Plan) -> int:
     return 0 if (probe.expected == UNKNOWN).all() and probe.next_directions is None else -(-left // CHUNK)
 
 
-def further_chunk(name: str, plan: Plan, index: int, own: Own | None = None) -> Verdict:
+def further_chunk(name: str, plan: Plan, index: int, own: Own) -> Verdict:
     """Return the verdict, without the oracle, on one chunk of the rays beyond the sample."""
-    own = own or Own()
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
     first = -(-fewer(name, plan.sample) // CHUNK)  # the sample has used the seeds below
     case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
@@ -166,14 +160,12 @@ def further_chunk(name: str, plan: Plan, index: int, own: Own | None = None) -> 
     return verdict + judge_next(case, *respawn(own, case))
 
 
-def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
+def _is_refused(case: HardCase, one: Contestant) -> bool:
     """Return True if Mesh or the query raises InputError for a case whose input is not finite."""
-    from wrt.scene.mesh import Mesh
-
     with suppress(InputError):
         Mesh(case.geometry.vertices, case.geometry.faces)
-        algorithm.prepare(case.geometry)
-        algorithm.closest(case.origins, case.directions)
+        one.prepare(case.geometry)
+        one.closest(case.origins, case.directions)
         return False
     return True
 
@@ -184,9 +176,9 @@ def _respawn_kernel(structure: Structure) -> Kernel:
     return make_respawn_kernel(structure.struct, structure.traversal(any_hit=False), surface_at)
 
 
-def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
+def respawn(one: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each."""
-    accel, n = algorithm.accel, len(case)
+    accel, n = one.accel, len(case)
     assert case.next_directions is not None
     out = Respawn()
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
@@ -201,22 +193,52 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 
-def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
+def _judge_all(one: Own, case: HardCase) -> Verdict:
     """Judge all hits of the first ALL_HITS_RAYS rays; return a verdict with the duplicates only."""
     part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS] for name in ("origins", "directions", "t_min", "t_max", "expected")})
-    hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
+    hits = all_hits(one.accel, part.origins, part.directions, part.t_min, part.t_max)
     verdict = judge_all_hits(part, hits.ray_id, hits.prim_id, hits.t)
     return Verdict(duplicate_hits=verdict.duplicate_hits, examples=[e for e in verdict.examples if "twice" in e["why"]])
 
 
-def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Line]:
-    """Measure all algorithms on one thread in alternating runs, on case A's sphere of 159,200 triangles.
-    Return for each one the quartiles of Mray/s and of the ratio to the first (default) algorithm's Mray/s, and bytes per triangle."""
-    case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
-    for algorithm in algorithms:
-        algorithm.prepare(case.geometry)
-    seconds = alternate({a.name: partial(a.closest, case.origins, case.directions) for a in algorithms}, runs)
-    default = seconds[algorithms[0].name]
-    return {a.name: Line(mrays_per_second=quartiles(SPEED_RAYS / seconds[a.name] / 1e6),
-                         ratio_to_default=quartiles(default / seconds[a.name]), bytes_per_triangle=a.bytes_per_triangle)
-            for a in algorithms}
+def wrong(verdict: Verdict) -> int:
+    return verdict.misses + verdict.false_hits + verdict.wrong_prim + verdict.self_hits
+
+
+def typical_error(rows: Sequence[Row]) -> float:
+    """Return the median over the cases of the 99.9th percentile of the error of t, in ulp.
+    A percentile over all rays would show only two or three ill-conditioned cases, such as edge-on or denormal triangles."""
+    errors = [row.v.t.p999 for row in rows]
+    return float(np.median([error for error in errors if np.isfinite(error)] or [np.nan]))
+
+
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    """Return the sums over all cases, the wrong rays by group of cases, and every row."""
+    speed = {row.name: row for row in rows if "mrays" in vars(row)}
+    judged = [row for row in rows if "case" in vars(row)]
+    names = list(dict.fromkeys(row.name for row in judged))
+    sums = []
+    for (name,), mine in grouped(judged, "name").items():
+        errors = sum(bool(row.note) and row.note not in ("refused", "ACCEPTED") for row in mine)
+        sums.append(Row(**{**vars(speed[name]), "v": _sum(mine), "typical": typical_error(mine), "errors": errors}))
+    lines = []
+    for group in [*sorted({row.case[0] for row in judged}), "A to H"]:
+        of_group = [row for row in judged if row.case[0] in (group if len(group) == 1 else "ABCDEFGH")]
+        verdicts = [_sum([row for row in of_group if row.name == name]) for name in names]
+        lines.append((group, *(f"{wrong(v)} of {v.rays}" for v in verdicts)))
+    return [tabled(ALL, sums, "All cases"), Part("Wrong rays by group of cases", "", ("group", *names), lines),
+            tabled(COLUMNS, judged, "Every case")]
+
+
+def _sum(rows: Sequence[Row]) -> Verdict:
+    return sum((row.v for row in rows), Verdict())
+
+
+def line(row: Row) -> str:
+    return "  ".join(cells(COLUMNS, row)) if "case" in vars(row) else f"{row.name}: {spread(row.mrays)} Mray/s"
+
+
+def machine(plan: Plan) -> str:
+    missing = [name for name in PEERS if plan.peers and contestant(name).missing()]
+    return machine_line(f"{thread_count(plan.threads)} threads used", versions("warp-lang", "embreex", "open3d", "mitsuba", "trimesh"),
+                        *([f"not installed: {', '.join(missing)}"] if missing else []))

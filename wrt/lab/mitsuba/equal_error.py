@@ -8,7 +8,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -21,8 +21,8 @@ from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.bench.timing import quartiles, shown, spread
-from wrt.lab.mitsuba.process import Job, MitsubaProcess, NotAvailable
-from wrt.lab.plans import Mitsuba as Plan
+from wrt.lab.mitsuba import Mitsuba as Plan
+from wrt.lab.mitsuba.process import Job, MitsubaProcess
 from wrt.renderer.options import Options
 from wrt.renderer.render import Renderer
 from wrt.scene.cameras import Camera
@@ -96,29 +96,6 @@ class _Measured:
                    process_ratio=side.process_seconds / ours.process_seconds, same_light=not side.bias**2 > SAME * ours.rmse**2)
 
 
-class _Rivals:
-    """The usable variants of Mitsuba, and the reasons why others are not available. Raise NotAvailable if no variant is usable."""
-
-    def __init__(self, jobs: list[Job], stack: ExitStack) -> None:
-        self.jobs, self.stack = {job.variant: job for job in jobs}, stack
-        self.measured: dict[str, _Measured] = {}
-        self.not_available: dict[str, str] = {}
-        self.each(self._start)
-
-    def _start(self, variant: str) -> None:
-        self.measured[variant] = _Measured(self.jobs[variant], self.stack.enter_context(MitsubaProcess(self.jobs[variant])))
-
-    def each(self, do: Callable[[str], None]) -> None:
-        for variant in [name for name in self.jobs if name not in self.not_available]:
-            try:
-                do(variant)
-            except NotAvailable as error:
-                self.measured.pop(variant, None)
-                self.not_available[variant] = str(error)
-        if not self.measured:
-            raise NotAvailable("; ".join(f"Mitsuba {variant}: {why}" for variant, why in self.not_available.items()))
-
-
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
         report: Callable[[str], None] = lambda line: None) -> Row:
     """Measure wrt and Mitsuba. command: arguments of `python -m wrt` that render this scene at 1 spp; None: time no process.
@@ -127,10 +104,28 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
     threads, ours = thread_count(options.threads), []
+    rivals: dict[str, _Measured] = {}
+    not_available: dict[str, str] = {}
+
+    def each(do: Callable[[str], None], variants: Iterable[str]) -> None:
+        """Call do(variant) for variants of Mitsuba. Leave out those that fail; raise InputError if none is left."""
+        for variant in list(variants):
+            try:
+                do(variant)
+            except InputError as error:
+                rivals.pop(variant, None)
+                not_available[variant] = str(error)
+        if not rivals:
+            raise InputError("; ".join(f"Mitsuba {variant}: {why}" for variant, why in not_available.items()))
+
     with ExitStack() as stack:
+
+        def begin(variant: str) -> None:
+            job = Job(variant, scene, options.camera, plan.integrator, threads)
+            rivals[variant] = _Measured(job, stack.enter_context(MitsubaProcess(job)))
+
         report("starting Mitsuba")
-        jobs = [Job(variant, scene, options.camera, plan.integrator, threads) for variant in dict.fromkeys(plan.variants)]
-        rivals = _Rivals(jobs, stack)
+        each(begin, dict.fromkeys(plan.variants))
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS], scene.settings.max_depth)
         renderer = Renderer(scene, options)
@@ -143,23 +138,23 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
         require_error(target)
-        rivals.each(lambda name: rivals.measured[name].choose_spp(pictures[0], truth, target, plan.rival_limit))
+        each(lambda name: rivals[name].choose_spp(pictures[0], truth, target, plan.rival_limit), rivals)
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
                 ours.append(our_picture(seed))
-            rivals.each(partial(lambda seed, name: rivals.measured[name].picture(seed), seed))
+            each(partial(lambda seed, name: rivals[name].picture(seed), seed), rivals)
             if turn % 2 == 1:
                 ours.append(our_picture(seed))
         report("whole processes")
-        rivals.each(lambda name: rivals.measured[name].time_starts(starts))
+        each(lambda name: rivals[name].time_starts(starts), rivals)
     ready = renderer.prepared.seconds
     prepare = max(ready["compile"], ready["upload"] + ready["build"])  # these run in parallel
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     require_error(side.rmse)
-    found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
+    found = {variant: measured.result(side, truth) for variant, measured in rivals.items()}
     return Row(scene=scene.name, size=scene.settings.size, integrator=plan.integrator, threads=threads, wrt=side, mitsuba=found,
-               not_available=rivals.not_available, reference=truth)
+               not_available=not_available, reference=truth)
 
 
 def require_error(error: float) -> None:

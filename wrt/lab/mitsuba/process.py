@@ -2,12 +2,13 @@
 
 For example, LLVM 15 and 16 crash at the first picture."""
 
+import importlib
 import importlib.util
 import multiprocessing
 import os
-import signal
 import time
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -19,20 +20,15 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"  # where Mitsuba's compiler, Dr.Jit, looks for LLVM
-VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
-SECONDS_TO_END = 10.0  # time to exit before the process is killed
 
 
-class NotAvailable(InputError):
-    """A variant of Mitsuba cannot be used on this machine; the message says why."""
-
-
-def require_llvm() -> None:
-    """Raise NotAvailable unless DRJIT_LIBLLVM_PATH names a file."""
+def llvm_missing() -> str:
+    """Return the reason why llvm_ad_rgb finds no LLVM library, or ""."""
     library = os.environ.get(PATH_VARIABLE, "")
-    if not os.path.isfile(library):
-        problem = f"names no file: {library}" if library else "is not set"
-        raise NotAvailable(f"llvm_ad_rgb needs an LLVM library, and {PATH_VARIABLE} {problem}; set it to the path of libLLVM (19 works)")
+    if os.path.isfile(library):
+        return ""
+    problem = f"names no file: {library}" if library else "is not set"
+    return f"llvm_ad_rgb needs an LLVM library, and {PATH_VARIABLE} {problem}; set it to the path of libLLVM (19 works)"
 
 
 class Job(NamedTuple):
@@ -48,80 +44,53 @@ class Job(NamedTuple):
 class MitsubaProcess:
     """A process that loads the scene and then renders pictures until it is closed. load_seconds: time to load the scene.
 
-    Raise NotAvailable if the variant is not usable or the process has ended. Raise InputError if Mitsuba is missing or cannot render the
-    scene exactly."""
+    Raise InputError if the variant is not usable, Mitsuba cannot render the scene exactly, or the process has ended."""
 
     def __init__(self, job: Job) -> None:
         if importlib.util.find_spec("mitsuba") is None:
             raise InputError("Mitsuba 3 is not usable (not installed)", hint='pip install "wrt[peers]" installs it')
-        if job.variant != "scalar_rgb" and job.integrator == "whitted":
-            raise NotAvailable('the integrator "whitted" is written in Python, which only scalar_rgb can run')
-        if job.variant.startswith("llvm"):
-            require_llvm()
-        spawn = multiprocessing.get_context("spawn")
-        self._pipe, childs = spawn.Pipe()
-        self._process = spawn.Process(target=serve, args=(childs, job), daemon=True)
-        self._process.start()
-        childs.close()
-        try:
-            self.load_seconds: float = self._ask()
-        except BaseException:
-            self._process.kill()
-            self.close()
-            raise
+        if job.variant.startswith("llvm") and (reason := llvm_missing()):
+            raise InputError(reason)
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+        self.load_seconds: float = self._ask(load, job)
 
     def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
         """Render a picture; return its seconds and pixels (H, W, 3) float32."""
-        return self._ask((spp, seed % 2**31))
+        found: tuple[float, np.ndarray] = self._ask(render, spp, seed % 2**31)
+        return found
 
-    def _ask(self, *questions: tuple[int, int]) -> Any:
+    def _ask(self, function: Any, *arguments: object) -> Any:
         try:
-            for question in questions:
-                self._pipe.send(question)
-            answer = self._pipe.recv()
-        except (OSError, EOFError) as error:
-            self._process.join()
-            code = self._process.exitcode or 0
-            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-            raise NotAvailable(f"its process ended with {how}") from error
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    def close(self) -> None:
-        """End the process."""
-        self._pipe.close()
-        self._process.join(SECONDS_TO_END)
-        self._process.kill()
-        self._process.join()
+            return self._pool.submit(function, *arguments).result()
+        except BrokenProcessPool as error:
+            raise InputError("its process ended without an answer") from error
 
     def __enter__(self) -> "MitsubaProcess":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        if kind is not None:
-            self._process.kill()  # it may still render a picture that is not needed
-        self.close()
+        self._pool.shutdown(wait=kind is None, cancel_futures=True)
 
 
-def serve(pipe: Connection, job: Job) -> None:
-    """Load the scene, then render on request until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends this process
+loaded: dict[str, Any] = {}  # of this process: Mitsuba's context, module and scene
+
+
+def load(job: Job) -> float:
+    """Load a scene in this process; return the seconds. Raise InputError if Mitsuba cannot."""
     os.dup2(2, 1)  # output to stderr, since the parent's standard output may be JSON
     try:
-        with mitsuba(job.variant) as mi:
-            importlib.import_module("drjit").set_thread_count(job.threads)
-            begin = time.perf_counter()
-            scene = translate(mi, job.scene, job.camera, job.integrator).scene
-            pipe.send(time.perf_counter() - begin)
-            while True:
-                spp, seed = pipe.recv()
-                begin = time.perf_counter()
-                pixels = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)
-                pipe.send((time.perf_counter() - begin, pixels))
-    except EOFError:
-        return
-    except InputError as error:
-        pipe.send(error)
+        loaded["context"] = mitsuba(job.variant)
+        loaded["mi"] = loaded["context"].__enter__()
+        importlib.import_module("drjit").set_thread_count(job.threads)
+        begin = time.perf_counter()
+        loaded["scene"] = translate(loaded["mi"], job.scene, job.camera, job.integrator).scene
+        return time.perf_counter() - begin
     except (ImportError, RuntimeError) as error:  # for example a library that cannot be loaded
-        pipe.send(NotAvailable(str(error)))
+        raise InputError(str(error)) from None
+
+
+def render(spp: int, seed: int) -> tuple[float, np.ndarray]:
+    """Render the loaded scene; return the seconds and pixels (H, W, 3) float32."""
+    begin = time.perf_counter()
+    pixels = np.array(loaded["mi"].render(loaded["scene"], spp=spp, seed=seed), dtype=np.float32)
+    return time.perf_counter() - begin, pixels

@@ -4,15 +4,14 @@ Tests use the variant scalar_rgb in their own process. Measurements also use llv
 variants trace with Embree's robust mode. wrt requests this mode, because Mitsuba's default is the fast mode.
 
 Mitsuba's picture has the expectation of wrt's picture in these cases:
-- integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces.
-- "path" and "volpath": only specular surfaces, a background and emissive shapes; glass with absorption needs "volpath". On diffuse
-  surfaces both add interreflection, which a Whitted tracer does not have.
+- integrators "path" and "volpath": only specular surfaces, a background and emissive shapes; glass with absorption needs "volpath". On
+  diffuse surfaces both add interreflection, which a Whitted tracer does not have.
 - "direct": diffuse surfaces, without a mirror or glass in view.
 Mitsuba never cuts rays by their throughput, so compare with min_throughput = 0. All other features are refused with an InputError."""
 
 import importlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
 from typing import NamedTuple
@@ -21,6 +20,7 @@ import numpy as np
 
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
+from wrt.lab.mitsuba import INTEGRATORS
 from wrt.lab.mitsuba.bsdfs import MitsubaObject, Plugin, refuse
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
@@ -28,7 +28,6 @@ from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.model import Scene
 
 VARIANT = "scalar_rgb"
-INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")
 
 
 @contextmanager
@@ -57,12 +56,20 @@ class Translation(NamedTuple):
     parts: dict[str, Part]
 
 
-def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
+# Function that makes an integrator with a light transport of its own, from the module `mitsuba`, the scene, whether the scene has an
+# emitter to sample, and the parts of the scene by shape id.
+MakeIntegrator = Callable[[ModuleType, Scene, bool, Mapping[str, Part]], MitsubaObject]
+
+
+def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | None = None,
+              integrator: str | MakeIntegrator = "auto") -> Translation:
     """Return the scene for the module `mitsuba` in its current variant, with sensor, film, sampler and integrator.
 
-    camera: a camera, or the name or index of a camera of the scene. integrator: one of INTEGRATORS. "auto" means "volpath" if a material
-    absorbs or is partly transparent, else "path". Raise InputError for features that cannot be translated exactly."""
-    as_choice(integrator, INTEGRATORS, "integrator")
+    camera: a camera, or the name or index of a camera of the scene. integrator: one of INTEGRATORS, or a MakeIntegrator. "auto" means
+    "volpath" if a material absorbs or is partly transparent, else "path". Raise InputError for features that cannot be translated
+    exactly."""
+    if isinstance(integrator, str):
+        as_choice(integrator, INTEGRATORS, "integrator")
     contents: Plugin = {"type": "scene", "embree_use_robust_intersections": True}
     parts: dict[str, Part] = {}
     for index, thing in enumerate(scene.objects):
@@ -86,7 +93,12 @@ def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | Non
         contents["darkness"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 0.0}
     _check_light_transport(scene, integrator)
 
-    contents["integrator"] = _integrator(mi, integrator, scene, lit, parts)
+    if not isinstance(integrator, str):
+        contents["integrator"] = integrator(mi, scene, lit, parts)
+    elif integrator == "direct":
+        contents["integrator"] = {"type": "direct"}
+    else:  # Mitsuba counts edges of a path: 1 edge is visible emission, 2 edges are direct light. A large rr_depth disables roulette.
+        contents["integrator"] = {"type": integrator, "max_depth": scene.settings.max_depth + 2, "rr_depth": 1 << 16}
     contents["sensor"] = _sensor(mi, scene, camera if isinstance(camera, CameraKind) else scene.camera(camera))
     try:
         return Translation(mi.load_dict(contents), parts)
@@ -94,19 +106,14 @@ def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | Non
         raise InputError(f"Mitsuba refuses the scene: {error}") from error
 
 
-def _check_light_transport(scene: Scene, integrator: str) -> None:
+def _check_light_transport(scene: Scene, integrator: str | MakeIntegrator) -> None:
     """Raise InputError for light transport of wrt that the integrator of Mitsuba does not have."""
     materials = scene.materials
     if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
         refuse('fresnel = "schlick"')
     if scene.lights and any(m.is_rough for m in materials if m.kind != "metallic_roughness"):
         refuse("highlights of point lights on rough surfaces (Mitsuba's are GGX, wrt's are Blinn-Phong or missing)")
-    if integrator == "whitted":
-        mixed = [m.name for m in materials if m.kind == "metallic_roughness"]
-        if mixed:  # Mitsuba's principled BSDF cannot sample its specular part alone
-            raise InputError(f'integrator "whitted" cannot render metallic_roughness (material {mixed[0]!r})', place="Mitsuba")
-        if scene.settings.glass_shadows == "tinted" and any(m.kind == "glass" and not m.thin for m in materials):
-            refuse('glass_shadows = "tinted"')
+    if not isinstance(integrator, str):
         return
     if max(scene.ambient) > 0.0:
         refuse("the ambient term")
@@ -117,20 +124,6 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
             refuse(f'absorption with integrator "{integrator}"')
         if any(m.alpha_mode != "opaque" for m in materials):
             refuse(f'alpha with integrator "{integrator}"')
-
-
-def _integrator(mi: ModuleType, name: str, scene: Scene, lit: bool, parts: dict[str, Part]) -> MitsubaObject:
-    max_depth = scene.settings.max_depth
-    if name == "whitted":
-        from wrt.lab.mitsuba.whitted import Walk, whitted_integrator
-
-        inside = {key: part.material.absorption for key, part in parts.items() if max(part.material.absorption) > 0.0}
-        blended = {key for key, part in parts.items() if part.material.alpha_mode == "blend"}
-        return whitted_integrator(mi, Walk(mi, max_depth, scene.ambient, lit, inside, blended))
-    if name == "direct":
-        return {"type": "direct"}
-    # Mitsuba counts edges of a path: 1 edge is visible emission, 2 edges are direct light. A large rr_depth disables Russian roulette.
-    return {"type": name, "max_depth": max_depth + 2, "rr_depth": 1 << 16}
 
 
 def _sensor(mi: ModuleType, scene: Scene, camera: CameraKind) -> Plugin:

@@ -17,7 +17,7 @@ from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, counters_of, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
-from wrt.lab.plans import Float64 as Plan
+from wrt.lab.rtcore import Float64 as Plan
 from wrt.scene.mesh import Mesh
 
 TITLE = "How often the triangle test needs float64 on a GPU"

@@ -17,7 +17,7 @@ from wrt.core.files import check_writable
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, mesh_name, tabled
-from wrt.lab.plans import RtCore as Plan
+from wrt.lab.rtcore import RtCore as Plan
 from wrt.lab.rtcore.model import LEGEND as LEGEND
 from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS

@@ -22,7 +22,7 @@ from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, mesh_name, tabled
 from wrt.lab.bench.report import run as run
-from wrt.lab.plans import WhatIf as Plan
+from wrt.lab.rtcore import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
 from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu

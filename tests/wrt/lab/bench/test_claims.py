@@ -14,13 +14,13 @@ from PIL import Image
 from tests.command_line import wrt
 from tests.refused import refused
 from wrt.lab.bench import claims as bench
+from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.report import Row, markdown, run
-from wrt.lab.bench.visibility import terrain
+from wrt.lab.claims import Claims as Plan
 from wrt.lab.claims import scenes
 from wrt.lab.claims.claim import CLAIMS, Claim, Figure, Study
 from wrt.lab.claims.scene_files import scene_files
 from wrt.lab.claims.scenes import PATH, open_scene
-from wrt.lab.plans import Claims as Plan
 from wrt.scene.shapes import icosphere
 
 

@@ -21,9 +21,8 @@ from wrt.cli.common import json_text
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted
 from wrt.lab.bench import error as bench
-from wrt.lab.bench import error_report as report
 from wrt.lab.bench import error_statistics as statistics
-from wrt.lab.bench.error_report import BASE
+from wrt.lab.bench.error import BASE
 from wrt.lab.bench.report import Row, cells
 from wrt.renderer.features import features_of
 from wrt.renderer.options import Options
@@ -261,14 +260,14 @@ def test_interrupted_renders_end_the_sweep(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.fixture(scope="module")
-def small() -> report.Sweep:
+def small() -> bench.Sweep:
     return bench.sweep(edge_scene(), bench.Plan(knobs=("sampler",), max_spp=4, repeats=3, reference_spp=64), Options())
 
 
-def test_the_report_says_everything(small: report.Sweep) -> None:
-    text = report.text(small)
+def test_the_report_says_everything(small: bench.Sweep) -> None:
+    text = bench.text(small)
     assert text.count("| sampler = independent | ") >= 4  # three rows, one slope
-    assert f"Its standard error is {report.number(small.reference.rmse)}" in text
+    assert f"Its standard error is {bench.number(small.reference.rmse)}" in text
     data = json.loads(json_text(small.as_dict()))
     assert [row["spp"] for row in data["rows"]] == [1, 2, 4] * 2 and data["reference"]["seeds"] == 8
     assert data["rows"][0]["rmse"]["low"] < data["rows"][0]["rmse"]["value"] < data["rows"][0]["rmse"]["high"]
@@ -277,10 +276,10 @@ def test_the_report_says_everything(small: report.Sweep) -> None:
     assert sum(line.endswith(" * |") for line in rows) == sum(row.pareto for row in small.rows) > 0
 
 
-def test_what_cannot_be_told_is_a_dash(small: report.Sweep) -> None:
+def test_what_cannot_be_told_is_a_dash(small: bench.Sweep) -> None:
     row = small.rows[0]
     unknown = Row(**vars(row) | {"rmse": statistics.UNKNOWN, "efficiency": statistics.UNKNOWN, "bias": math.nan})
-    named = dict(zip(report.COLUMNS, cells(report.COLUMNS, unknown), strict=True))
+    named = dict(zip(bench.COLUMNS, cells(bench.COLUMNS, unknown), strict=True))
     assert named["RMSE"] == "-" and named["efficiency"] == "-" and named["bias"].startswith("< ")
 
 
@@ -344,4 +343,4 @@ def test_constant_background_has_no_error() -> None:
     scene = Scene(background=ConstantBackground((0.5, 0.5, 0.5)), cameras=(Camera(),), settings=Settings(size=(4, 4)))
     result = bench.sweep(scene, bench.Plan(knobs=("fresnel",), max_spp=4, repeats=3, reference_spp=4), Options())
     assert all(math.isnan(row.rmse.value) and row.noise == 0.0 and not row.pareto for row in result.rows)
-    assert report.text(result)
+    assert bench.text(result)

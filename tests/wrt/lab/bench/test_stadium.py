@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wrt.accel.scenes.build import build
-from wrt.lab.bench.accel import in_stadium, stands
+from wrt.lab.bench.meshes import in_stadium, stands
 from wrt.lab.bench.rays import ray_sets
 from wrt.scene.shapes import icosphere
 

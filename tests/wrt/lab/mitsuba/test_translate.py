@@ -588,16 +588,13 @@ def test_features_that_an_integrator_lacks_are_refused():
     plain = Scene(objects=(Object(QUAD, (Material(),)),), cameras=(FRONT,))
     clear = Material("glass", absorption=(1, 1, 1))
     blades = replace(FRONT, aperture_radius=0.1, blades=6)
-    tinted = Scene(objects=(Object(QUAD, (clear,)),), cameras=(FRONT,), settings=Settings(glass_shadows="tinted"))
+    schlick = Scene(objects=(Object(QUAD, (clear,)),), cameras=(FRONT,), settings=Settings(fresnel="schlick"))
     for scene, integrator, message in (
         (replace(plain, ambient=(0.1, 0.1, 0.1)), "path", (None, "ambient", "Mitsuba")),
         (replace(plain, cameras=(blades,)), "path", (None, "blades", "Mitsuba: camera ''")),
         (replace(plain, objects=(Object(QUAD, (clear,)),)), "path", (None, "absorption", "Mitsuba")),
         (replace(plain, objects=(Object(QUAD, (Material(alpha_mode="blend", alpha=0.5),)),)), "direct", (None, "alpha", "Mitsuba")),
-        (tinted, "whitted", (None, "glass_shadows", "Mitsuba")),
-        (tinted.with_settings(fresnel="schlick"), "path", (None, "schlick", "Mitsuba")),
-        (replace(plain, objects=(Object(QUAD, (Material("metallic_roughness"),)),)), "whitted",
-         (None, "metallic_roughness", "Mitsuba: material ''")),
+        (schlick, "path", (None, "schlick", "Mitsuba")),
         (Scene(objects=(Object(QUAD, (Material("conductor", roughness=0.5),)),), cameras=(FRONT,),
                lights=(PointLight((0, 0, 1), (1, 1, 1)),)), "path", (None, "highlights", "Mitsuba")),
     ):

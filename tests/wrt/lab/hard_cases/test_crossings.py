@@ -11,8 +11,8 @@ import wrt
 from tests.command_line import wrt as run
 from wrt.accel.geometry import Geometry
 from wrt.accel.points.contains import open_edges
-from wrt.lab.bench import closed
 from wrt.lab.bench.report import Row
+from wrt.lab.hard_cases import crossings as closed
 from wrt.lab.oracle.oracle import Reference
 from wrt.scene import shapes
 

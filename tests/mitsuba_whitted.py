@@ -1,9 +1,14 @@
 """A Whitted integrator for Mitsuba: wrt's light transport on Mitsuba's geometry, BSDFs and emitters."""
 
+from __future__ import annotations
+
 import importlib
+from collections.abc import Mapping
 from types import ModuleType
 
 from wrt.lab.mitsuba.bsdfs import MitsubaObject
+from wrt.lab.mitsuba.shapes import Part
+from wrt.scene.model import Scene
 from wrt.scene.values import Color
 
 MAX_TRANSPARENT = 256  # most successive surfaces that a ray passes straight through
@@ -93,8 +98,11 @@ class Walk:
         return radiance, True, []
 
 
-def whitted_integrator(mi: MitsubaObject, walk: Walk) -> MitsubaObject:
+def whitted(mi: MitsubaObject, scene: Scene, lit: bool, parts: Mapping[str, Part]) -> MitsubaObject:
     """Return a Mitsuba integrator that samples a Walk in Python, at about 10 microseconds a bounce: for small pictures only."""
+    inside = {key: part.material.absorption for key, part in parts.items() if max(part.material.absorption) > 0.0}
+    blended = {key for key, part in parts.items() if part.material.alpha_mode == "blend"}
+    walk = Walk(mi, scene.settings.max_depth, scene.ambient, lit, inside, blended)
 
     class Whitted(mi.SamplingIntegrator):  # the base class exists only after a variant is set
         def __init__(self) -> None:

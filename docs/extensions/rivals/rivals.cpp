@@ -1,10 +1,60 @@
-// tinybvh's trees for CPUs behind functions for ctypes. wrt/lab/hard_cases/tinybvh.py compiles this file with tinybvh's header.
-#define TINYBVH_IMPLEMENTATION
-#include "tiny_bvh.h"
+// Embree's packets of sixteen rays, and tinybvh's trees for CPUs, behind functions for ctypes. rivals.py compiles this file.
+#include <cmath>
+#include <cstring>
 #include <vector>
 
-using namespace tinybvh;
+// RTCRayHit16 of Embree 4 (rtcore_ray.h).
+struct alignas(64) RayHits {
+    float org_x[16], org_y[16], org_z[16], tnear[16], dir_x[16], dir_y[16], dir_z[16], time[16], tfar[16];
+    unsigned mask[16], id[16], flags[16];
+    float ng_x[16], ng_y[16], ng_z[16], u[16], v[16];
+    unsigned prim_id[16], geom_id[16], inst_id[16], inst_prim_id[16];
+};
 
+// Trace n rays by `function`, the address of rtcIntersect16 or, for any hit, of rtcOccluded16. On entry, t has the rays' t_max. For any
+// hit, t becomes -inf for a ray that hits, and the other results stay. Embree wants denormals flushed to 0 (its manual, "Performance
+// Recommendations").
+extern "C" void embree_packets(void* function, void* scene, bool coherent, bool any_hit, int n, const float* origins,
+                               const float* directions, float* t, float* u, float* v, int* prim_id) {
+    RayHits r;
+    struct { unsigned flags, features; void *context, *filter, *intersect; float rest[4]; } arguments = {};  // RTCIntersectArguments
+    arguments.flags = coherent ? 1u << 16 : 0u;
+    arguments.features = ~0u;
+    alignas(64) int valid[16];
+    const auto call = (void (*)(const int*, void*, void*, void*))function;
+#if defined(__x86_64__)
+    const unsigned before = __builtin_ia32_stmxcsr();
+    __builtin_ia32_ldmxcsr(before | 0x8040);
+#endif
+    for (int first = 0; first < n; first += 16) {
+        for (int k = 0; k < 16; ++k) {
+            const int i = first + k < n ? first + k : n - 1;
+            const float *o = origins + 3 * i, *d = directions + 3 * i;
+            valid[k] = first + k < n ? -1 : 0;
+            r.org_x[k] = o[0]; r.org_y[k] = o[1]; r.org_z[k] = o[2];
+            r.dir_x[k] = d[0]; r.dir_y[k] = d[1]; r.dir_z[k] = d[2];
+            r.tnear[k] = 0.0f; r.tfar[k] = t[i]; r.time[k] = 0.0f;
+            r.mask[k] = ~0u; r.id[k] = 0; r.flags[k] = 0;
+            r.prim_id[k] = r.geom_id[k] = r.inst_id[k] = r.inst_prim_id[k] = ~0u;
+        }
+        call(valid, scene, &r, &arguments);
+        for (int k = 0; k < 16 && first + k < n; ++k) {
+            t[first + k] = r.tfar[k];
+            if (any_hit) continue;
+            u[first + k] = r.u[k]; v[first + k] = r.v[k];
+            prim_id[first + k] = r.geom_id[k] == ~0u ? -1 : (int)r.prim_id[k];
+        }
+    }
+#if defined(__x86_64__)
+    __builtin_ia32_ldmxcsr(before);
+#endif
+}
+
+#if __has_include("tiny_bvh.h")
+#define TINYBVH_IMPLEMENTATION
+#include "tiny_bvh.h"
+
+using namespace tinybvh;
 // A ray of tinybvh has a unit direction, so `scale` is the length of the caller's direction.
 struct Rays { std::vector<Ray> rays; std::vector<float> scale; };
 
@@ -81,3 +131,4 @@ void occluded(const Tree* tree, const Rays* rays, bool* out) {
 }
 
 }
+#endif

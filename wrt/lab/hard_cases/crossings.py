@@ -17,9 +17,9 @@ from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.report import Columns, Groups, Part, Row, mesh_name, tabled
 from wrt.lab.bench.timing import with_seconds
+from wrt.lab.hard_cases import Closed as Plan
 from wrt.lab.hard_cases.common import targets, unit_vectors
 from wrt.lab.oracle.oracle import Place, Reference, reference_of
-from wrt.lab.plans import Closed as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
 
