@@ -143,8 +143,8 @@ class TinyBvh(FromC):
 
     def search(self, rays, threads):
         n, library, tree = len(rays), self.library, self.tree
-        own = self.library.make_rays(*addresses(*(np.ascontiguousarray(each, np.float32)
-                                                  for each in (rays.origins, rays.directions, rays.t_max))), n)
+        arrays = [np.ascontiguousarray(each, np.float32) for each in (rays.origins, rays.directions, rays.t_max)]
+        own = library.make_rays(*addresses(*arrays), n)
 
         def closest():
             out = [*np.empty((3, n), np.float32), np.empty(n, np.int32)]
