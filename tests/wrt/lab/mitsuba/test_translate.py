@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.refused import refused
-from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera, FisheyeCamera, OrthographicCamera
-from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
-from wrt.scene.materials import Checkerboard, Material, Texture
+from wrt.scene.lights import PointLight
+from wrt.scene.materials import Material, Texture
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
@@ -146,35 +146,6 @@ def test_a_camera_that_mitsuba_has_not_is_refused_but_its_rays_can_be_traced():
         render_mitsuba(scene, size=(8, 8), spp=1)
     depth = aov_mitsuba(scene, size=(33, 33)).depth
     assert depth[16, 16] == pytest.approx(4.0) and np.isinf(depth[0, 0])
-
-
-def test_thin_lens_blurs_as_the_equation_says():
-    camera = replace(OBLIQUE, aperture_radius=0.4, focus_distance=1.6)
-    size, spp = (32, 18), 256
-    scene = Scene(objects=(Object(QUAD, (glowing((1, 1, 1)),), transform=placed(0.3, 0.1, 0, 0.3)),), cameras=(camera,))
-    result = render_mitsuba(scene, size=size, spp=spp, integrator="whitted")
-
-    rng = np.random.default_rng(1)
-    matrix = camera.camera_to_world
-    total = np.zeros((18, 32))
-    for _ in range(spp):
-        x = (2 * (np.arange(32) + rng.random((18, 32))) / 32 - 1) * math.tan(camera.fov_y / 2) * 32 / 18
-        y = (1 - 2 * (np.arange(18)[:, None] + rng.random((18, 32))) / 18) * math.tan(camera.fov_y / 2)
-        in_focus = camera.focus_distance * np.stack([x, y, -np.ones_like(x)], axis=-1)
-        radius, angle = np.sqrt(rng.random((18, 32))) * camera.aperture_radius, 2 * np.pi * rng.random((18, 32))
-        lens = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * radius], axis=-1)
-        origin = lens @ matrix[:3, :3].T + matrix[:3, 3]
-        direction = (in_focus - lens) @ matrix[:3, :3].T
-        point = origin + direction * (-origin[..., 2] / direction[..., 2])[..., None]
-        total += (abs(point[..., 0] - 0.3) < 0.3) & (abs(point[..., 1] - 0.1) < 0.3)
-    mean = total / spp
-    variance = mean * (1 - mean) / spp + result.variance[..., 0]
-    noisy = variance > 1e-4
-    z = (result.pixels[..., 0] - mean)[noisy] / np.sqrt(variance[noisy])
-    assert noisy.sum() > 40 and abs(z).max() < 5 and abs(z.std() - 1) < 0.4
-    # The same quad without a lens is sharp: the test would not see a lens that does nothing otherwise.
-    sharp = render_mitsuba(scene, replace(camera, aperture_radius=0.0), size=size, spp=16, integrator="whitted").pixels
-    assert abs(sharp[..., 0] - mean).max() > 0.3
 
 
 def test_the_variance_is_that_of_the_mean():
@@ -313,18 +284,6 @@ def test_a_zero_normal_is_flat_there():
 # --- materials --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("integrator", ["path", "whitted"])
-def test_furnace_of_mirrors_and_glass(integrator):
-    spheres = (
-        Sphere((-0.6, 0, 0), 0.5, Material("glass", albedo=(1, 1, 1))),
-        Sphere((0.6, 0, 0), 0.5, Material("mirror", albedo=(1, 1, 1))),
-        Sphere((0, 0.6, -1), 0.5, Material("glass", albedo=(1, 1, 1), thin=True)),
-    )
-    scene = Scene(spheres=spheres, cameras=(FRONT,), background=WHITE_SKY, settings=Settings(max_depth=64))
-    pixels = render_mitsuba(scene, size=(16, 9), spp=64, integrator=integrator).pixels
-    np.testing.assert_allclose(pixels, 1.0, atol=2e-3)
-
-
 def test_furnace_of_diffuse_surfaces():
     scene = Scene(spheres=(Sphere((0, 0, 0), 0.8, Material(albedo=(1, 0.5, 0.25))),), cameras=(FRONT,),
                   background=WHITE_SKY)
@@ -332,41 +291,6 @@ def test_furnace_of_diffuse_surfaces():
     np.testing.assert_allclose(mean, (1, 0.5, 0.25), atol=5 * error.max())
     mean, error = center_pixel(replace(scene, background=ConstantBackground(), ambient=(1, 1, 2)), integrator="whitted")
     np.testing.assert_allclose(mean, (1, 0.5, 0.5), rtol=1e-5)
-
-
-@pytest.mark.parametrize("integrator", ["volpath", "whitted"])
-def test_an_absorbing_slab(integrator):
-    sigma, thickness, ior = np.array([0.2, 1.0, 3.0]), 0.5, 1.6
-    glass = Material("glass", albedo=(1, 1, 1), ior=ior, absorption=tuple(sigma))
-    box = np.array([[x, y, z] for z in (0, -thickness) for y in (-1, 1) for x in (-1, 1)], np.float32)
-    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-                      [0, 6, 4], [1, 5, 7], [1, 7, 3]], np.int32)
-    scene = Scene(objects=(Object(Mesh(box, faces), (glass,)),), cameras=(FRONT,), background=WHITE_SKY,
-                  settings=Settings(max_depth=32))
-    mean, error = center_pixel(scene, spp=65536 if integrator == "volpath" else 4096, integrator=integrator)
-    r, a = ((ior - 1) / (ior + 1)) ** 2, np.exp(-sigma * thickness)
-    inner = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
-    expected = inner + r + r * a * inner
-    assert (abs(mean - expected) < 5 * error + 1e-4).all() and error.max() < 0.01
-
-
-def test_reflection_at_normal_incidence():
-    quad = lambda material: Scene(objects=(Object(QUAD, (material,)),), cameras=(FRONT,),
-                                  background=GradientBackground(bottom=(0, 0, 0), top=(0, 0, 0)), ambient=(0, 0, 0))
-    behind = Object(QUAD, (glowing((1, 1, 1), two_sided=False),), transform=rotation(1, math.pi) @ placed(z=-8))
-    gold = Material("conductor", eta=(0.183, 0.422, 1.373), k=(3.424, 2.346, 1.771))
-    eta, k = np.array(gold.eta), np.array(gold.k)
-    cases = [
-        (gold, ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)),
-        (replace(gold, roughness=0.005), ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)),
-        (Material("mirror", albedo=(0.9, 0.5, 0.1)), np.array([0.9, 0.5, 0.1])),
-        (Material("glass", ior=1.5, thin=True), np.full(3, 2 * 0.04 / 1.04)),
-    ]
-    for material, expected in cases:
-        scene = quad(material)
-        scene = replace(scene, objects=(*scene.objects, behind))
-        mean, error = center_pixel(scene, spp=4096, integrator="whitted")
-        assert (abs(mean - expected) < 5 * error + 1e-5).all(), (material.kind, mean, expected)
 
 
 @pytest.mark.parametrize("integrator", ["path", "whitted"])
@@ -418,18 +342,6 @@ def test_textures_lie_as_in_gltf(wrap):
     assert difference.mean() < 0.01 and np.quantile(difference, 0.99) < 0.12  # a pixel is an average around its centre
 
 
-def test_a_checkerboard_starts_with_its_first_color():
-    board = Checkerboard(color_a=(1, 0, 0), color_b=(0, 1, 0), scale=3)
-    scene = Scene(objects=(Object(QUAD, (glowing((1, 0.5, 1), emission_texture=board),)),), cameras=(FRONT,))
-    pixels = render_mitsuba(scene, size=(60, 60), spp=8, integrator="whitted").pixels
-    point = plane_hit(FRONT, (60, 60))
-    u, v = 3 * (point[..., 0] + 1) / 2, 3 * (1 - point[..., 1]) / 2
-    certain = (np.minimum(abs(u - np.round(u)), abs(v - np.round(v))) > 0.1) & (abs(point[..., :2]).max(axis=-1) < 1)
-    first = (np.floor(u) + np.floor(v)) % 2 == 0
-    np.testing.assert_allclose(pixels[certain & first], np.tile([1, 0, 0], ((certain & first).sum(), 1)), atol=1e-6)
-    np.testing.assert_allclose(pixels[certain & ~first], np.tile([0, 0.5, 0], ((certain & ~first).sum(), 1)), atol=1e-6)
-
-
 def test_each_face_has_its_material():
     materials = (glowing((1, 0, 0)), glowing((0, 1, 0)), glowing((0, 0, 1)))
     scene = Scene(objects=(Object(QUAD, materials, face_material=np.array([2, 0])),), cameras=(FRONT,))
@@ -458,84 +370,6 @@ def test_blended_surfaces_let_light_through():
 # --- lights and backgrounds -------------------------------------------------------------------------------------------
 
 
-def lit_quad(light, size=(21, 21), albedo=(0.8, 0.4, 0.2)) -> tuple[np.ndarray, np.ndarray]:
-    scene = Scene(objects=(Object(QUAD, (Material(albedo=albedo),), transform=placed(scale=4)),), cameras=(FRONT,),
-                  lights=(light,))
-    return render_mitsuba(scene, size=size, spp=36, integrator="whitted").pixels, plane_hit(FRONT, size)
-
-
-def test_a_point_light_falls_with_the_square():
-    pixels, point = lit_quad(PointLight((0.3, 0.2, 1.5), (3, 4, 5)))
-    way = np.array([0.3, 0.2, 1.5]) - point
-    distance = np.linalg.norm(way, axis=-1, keepdims=True)
-    expected = np.array([3, 4, 5]) * way[..., 2:] / distance**3 * np.array([0.8, 0.4, 0.2]) / np.pi
-    np.testing.assert_allclose(pixels, expected, rtol=0.03)
-
-
-def test_a_directional_light_is_the_same_everywhere():
-    pixels, _ = lit_quad(DirectionalLight((1, 2, -2), (3, 4, 5)))
-    expected = np.array([3, 4, 5]) * (2 / 3) * np.array([0.8, 0.4, 0.2]) / np.pi
-    np.testing.assert_allclose(pixels, np.broadcast_to(expected, pixels.shape), rtol=1e-4)
-
-
-@pytest.mark.parametrize(("inner", "outer"), [(0.2, 0.5), (0.0, 1.2), (0.4, 0.4)])
-def test_a_spot_light_has_gltfs_falloff(inner, outer):
-    position, axis = np.array([0.4, 0.3, 1.5]), np.array([-0.3, -0.2, -1.5])
-    axis /= np.linalg.norm(axis)
-    floor = Object(QUAD, (Material(albedo=(1, 1, 1)),), transform=placed(scale=20))
-    scene = Scene(objects=(floor,), lights=(SpotLight(tuple(position), tuple(axis), (3, 4, 5), inner, outer),))
-    middle = position + axis * (1.5 / -axis[2])
-    for angle in [0.02, *np.linspace(inner, outer, 6)[1:-1], 0.98 * outer, 1.02 * outer]:
-        target = middle + math.tan(angle) * np.array([1.5, 0.3, 0])
-        camera = Camera.look_at((-1, 1, 3), target, fov_y=1e-4)
-        mean = render_mitsuba(scene, camera, size=(1, 1), spp=4, integrator="whitted").pixels[0, 0]
-        way = position - target
-        distance = np.linalg.norm(way)
-        cosine = -way @ axis / distance
-        ramp = (cosine - math.cos(outer)) / max(math.cos(inner) - math.cos(outer), 1e-9)
-        falloff = min(max(ramp, 0), 1) ** 2
-        unshaded = np.array([3, 4, 5]) * way[2] / distance**3 / np.pi
-        np.testing.assert_allclose(mean, falloff * unshaded, atol=1e-3 * unshaded.max())
-
-
-def environment_value(image: np.ndarray, directions: np.ndarray, turn: float) -> np.ndarray:
-    """Bilinear look-up as EnvironmentBackground's docstring says: middle at -z, rightwards to +x, row 0 up."""
-    height, width = image.shape[:2]
-    x, y, z = (directions @ rotation(1, -turn)[:3, :3].T).T  # into the picture's own frame
-    column = (np.arctan2(x, -z) / (2 * np.pi) + 0.5) * width - 0.5
-    row = np.arccos(np.clip(y, -1, 1)) / np.pi * height - 0.5
-    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
-    fx, fy = (column - left)[:, None], (row - top)[:, None]
-    texel = lambda r, c: image[np.clip(r, 0, height - 1), c % width]
-    upper = (1 - fx) * texel(top, left) + fx * texel(top, left + 1)
-    lower = (1 - fx) * texel(top + 1, left) + fx * texel(top + 1, left + 1)
-    return (1 - fy) * upper + fy * lower
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.7, -2.5])
-def test_an_environment_is_seen_where_it_should_be(turn):
-    rng = np.random.default_rng(11)
-    image = rng.uniform(0, 1, (5, 8, 3)).astype(np.float32)
-    background = EnvironmentBackground(image, scale=2.0, rotation=turn)
-    camera = Camera.look_at((0.3, 0.2, 0.1), (-1, 0.7, 0.4), fov_y=math.radians(100))
-    scene = Scene(cameras=(camera,), background=background)
-    with mitsuba() as mi:
-        emitter = to_mitsuba(scene).environment()
-        directions = rng.normal(size=(400, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        seen = []
-        for direction in directions.tolist():
-            si = mi.SurfaceInteraction3f()
-            si.wi = [-x for x in direction]
-            seen.append(np.array(emitter.eval(si)))
-    np.testing.assert_allclose(seen, 2 * environment_value(image, directions, turn), atol=1e-4)
-
-    pixels = render_mitsuba(scene, size=(24, 16), spp=64, integrator="path").pixels
-    _, rays = camera_rays(camera, (24 * 8, 16 * 8))
-    expected = 2 * environment_value(image, rays.reshape(-1, 3), turn).reshape(16, 8, 24, 8, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(pixels, expected, atol=0.05)
-
-
 def test_a_gradient_is_linear_in_the_height():
     background = GradientBackground(bottom=(1, 0, 0.5), top=(0, 1, 2))
     scene = Scene(cameras=(FRONT,), background=background)
@@ -549,22 +383,6 @@ def test_a_gradient_is_linear_in_the_height():
             share = 0.5 * (direction[1] + 1)
             expected = (1 - share) * np.array(background.bottom) + share * np.array(background.top)
             np.testing.assert_allclose(np.array(emitter.eval(si)), expected, atol=1e-5)
-
-
-def test_an_area_light_gives_the_form_factors_light():
-    """A disk-like small light at distance d: irradiance tends to L A cos cos / d^2."""
-    light = Object(QUAD, (Material(albedo=(0, 0, 0), emission=(100, 100, 100)),),
-                   transform=placed(0.5, 0, 2) @ rotation(1, math.pi) @ placed(scale=0.02))
-    floor = Object(QUAD, (Material(albedo=(1, 1, 1)),))
-    scene = Scene(objects=(floor, light), cameras=(FRONT,))
-    squared = 0.5**2 + 2**2
-    expected = 100 * 0.04**2 * (4 / squared) / squared / math.pi
-    for integrator in ("whitted", "direct"):
-        mean, _ = center_pixel(scene, spp=256, integrator=integrator)
-        np.testing.assert_allclose(mean, expected, rtol=2e-3)
-    unlit = replace(light.materials[0], emits_light=False)
-    dark = replace(scene, objects=(floor, replace(light, materials=(unlit,))))
-    assert (center_pixel(dark, spp=64, integrator="whitted")[0] == 0).all()
 
 
 # --- what cannot be translated ----------------------------------------------------------------------------------------
