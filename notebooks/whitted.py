@@ -41,13 +41,13 @@ picture = wrt.render(scene, spp=4, crop=(x, y, x + 1, y + 1))
 assert (every.radiance == picture.pixels.reshape(3)).all()
 
 # %%
-def shown(inspection, view):
-    figure = inspection.figure(view)
+def shown(inspection):
+    figure = inspection.figure()
     figure.set_dpi(72)
     return figure
 
 
-shown(tree, "section")
+shown(tree)
 
 # %% [markdown]
 # At a matte surface, a *shadow ray* asks each light whether it is seen (dashed lines). A tree ends at matte surfaces, at the background,
@@ -148,7 +148,7 @@ print(f"critical angle of glass: {critical:.1f} degrees")
 # A prism deflects rays, and inner reflections make its tree deep:
 
 # %%
-shown(wrt.inspect("../scenes/glass_slab.toml", (440, 215), sample=0, min_throughput=0.01), "section")
+shown(wrt.inspect("../scenes/glass_slab.toml", (440, 215), sample=0, min_throughput=0.01))
 
 # %% [markdown]
 # ## Fresnel: how much is reflected

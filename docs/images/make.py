@@ -77,9 +77,9 @@ def glass(folder: Path) -> Path:
 
 def rays() -> None:
     """Draw the rays of a pixel that shows a prism: refraction, inner reflections, and the shadow rays of a point behind it."""
-    tree = wrt.inspect(HERE.parents[1] / "scenes" / "glass_slab.toml", (440, 215), 0, min_throughput=0.01, spp=64)
+    tree = wrt.inspect(HERE.parents[1] / "scenes" / "glass_slab.toml", (440, 215), 0, min_throughput=0.01, spp=1)
     file = io.BytesIO()
-    tree.figure("picture").savefig(file)
+    tree.figure().savefig(file)
     picture = Image.open(file).convert("RGB")
     picture = picture.resize((1000, round(picture.height * 1000 / picture.width)), Image.Resampling.LANCZOS)
     picture.save(HERE / "rays.jpg", quality=88, optimize=True)

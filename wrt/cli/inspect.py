@@ -16,17 +16,13 @@ PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; writ
 @click.option("--pixel", type=PIXEL, required=True, help="The pixel, from the top left")
 @click.option("--sample", type=int, help="Trace only this sample, from 0  [default: all samples of the pixel]")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Drawing of the first sample traced: .png, .svg or .pdf")
-@click.option("--view", default="both", show_default=True,
-              help="What to draw: section (2D), picture (the rays in a picture from the side) or both")
 @shared("spp", "size", "seed", "threads", "camera", "max_depth", "assignments", "accel", "device", "quiet", "as_json")
-def inspect(scene: Path, output: Path | None, view: str, assignments: Assignments, quiet: bool, as_json: bool, **options: Parsed) -> None:
+def inspect(scene: Path, output: Path | None, assignments: Assignments, quiet: bool, as_json: bool, **options: Parsed) -> None:
     """Print the tree of rays of a pixel of SCENE. It has what each ray hits, why it ends, and what it adds to the pixel."""
-    from wrt.core.checks import as_choice
     from wrt.core.files import check_writable
-    from wrt.renderer.inspector.drawing import VIEWS, require_drawable
+    from wrt.renderer.inspector.drawing import require_drawable
     from wrt.renderer.inspector.inspect import inspect as inspect_pixel
 
-    as_choice(view, VIEWS, "--view")
     if output is not None:
         check_writable(require_drawable(output))
     settings = settings_of(assignments, {name: options.pop(name) for name in ("spp", "size", "max_depth")})
@@ -34,7 +30,7 @@ def inspect(scene: Path, output: Path | None, view: str, assignments: Assignment
     with warnings_reported(quiet), naming(scene):
         found = inspect_pixel(loaded, **settings, **options)
         if output is not None:
-            found.save(output, view)
+            found.save(output)
     if as_json:
         say_json({"output": None if output is None else str(output), **found.to_dict()})
     else:

@@ -46,23 +46,21 @@ class Access:
             raise Refused("origin", f"a request by a page of the origin {shown(origins)}; --allow-origin can allow it")
 
     def strip_token(self, target: str) -> tuple[str, str]:
-        """Return the path of a request without the token, and the relative address to redirect to ("": do not redirect).
+        """Return the path of a request without the token, and the address to redirect to ("": do not redirect).
 
-        target: path and query of the request. Raises Refused unless the path begins with the token, or the query has `token=` with it."""
+        target: path and query of the request. The address is relative, because a proxy may serve the viewer under a sub-path.
+        Raises Refused unless the path begins with the token, or the query has `token=` with it."""
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
-        if path.startswith("/") and self._is_token(first):
-            return "/" + rest, "" if slash else self._page(query)
         pairs = parse_qsl(query, keep_blank_values=True)
+        others = urlencode([pair for pair in pairs if pair[0] != "token"])
+        page = f"{self.token}/" + (f"?{others}" if others else "")
+        if path.startswith("/") and self._is_token(first):
+            return "/" + rest, "" if slash else page
         tokens = [value for name, value in pairs if name == "token"]
         if path.startswith("/") and len(tokens) == 1 and self._is_token(tokens[0]):
-            others = [pair for pair in pairs if pair[0] != "token"]
-            return path, self._page(urlencode(others)) if path == "/" else ""
+            return path, page if path == "/" else ""
         raise Refused("token", "a request without the token of the printed address")
-
-    def _page(self, query: str) -> str:
-        """Return the page's address, relative to the viewer's root, because a proxy may serve the viewer under a sub-path."""
-        return f"{self.token}/" + (f"?{query}" if query else "")
 
     def _is_token(self, text: str) -> bool:
         return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
@@ -92,8 +90,7 @@ def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
         names, home = set(LOOPBACK), LOOPBACK[0] if ip.version == 4 else LOOPBACK[2]
     elif ip.is_loopback:
         names |= set(LOOPBACK)
-    origins = {origin_of("http", name, port) for name in names} | set(place.allow_origins)
-    access = Access(frozenset(origins), port)
+    access = Access(frozenset(origin_of("http", name, port) for name in names) | frozenset(place.allow_origins), port)
     return access, f"{origin_of('http', home, port)}/?token={access.token}"
 
 
@@ -116,8 +113,7 @@ def as_origin(text: str) -> str:
     return origin_of(match[1], match[2], port)
 
 
-def shown(values: object) -> str:
+def shown(value: object) -> str:
     """Return a value from a client as text of at most 60 characters, for a message."""
-    text = ", ".join(map(repr, values)) if isinstance(values, list) else repr(values)
-    text = text or "no name"
+    text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,7 +1,6 @@
-"""The camera that a user steers: orbits, pans, dollies and walks with undo and reset, and its table of a TOML scene file."""
+"""The camera that a user steers: orbits, pans, dollies and walks, and its table of a TOML scene file."""
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +16,6 @@ PARALLEL = 0.999  # Largest |cosine| between the view direction and +y for which
 NO_FOCUS = Camera().focus_distance  # Focus distance of a camera whose scene sets no focus.
 LEVEL = 1e-6  # Largest |y| of the x axis of an upright camera.
 STEEPEST = math.radians(89.0)  # Largest angle of the view above or below the horizon.
-MOST_UNDOS = 100
 PRECISION = 1e-5  # Largest error of a camera's TOML table, relative to the distance of its target.
 
 
@@ -116,36 +114,29 @@ MOVED: dict[str, Callable[[Pose, Sequence[float]], Pose]] = {each.__name__: each
 
 
 class Steering:
-    """The pose that the user steers, and the poses before. `start` is the pose to which `reset` returns."""
+    """The pose that the user steers, and `start`, to which `reset` returns: a camera of the scene, chosen by name."""
 
-    def __init__(self, start: Pose) -> None:
-        self.start = self.pose = start
-        self._before: deque[Pose] = deque(maxlen=MOST_UNDOS)
-        self._changed: tuple[frozenset[str], Pose] | None = None  # fields that `change` has changed last, and the result
+    def __init__(self, scene: Scene, camera: CameraKind) -> None:
+        self._scene = scene
+        self.names = tuple(each.name or f"camera {i}" for i, each in enumerate(scene.cameras))
+        self.name = next((name for name, each in zip(self.names, scene.cameras, strict=True) if each is camera), camera.name)
+        self.start = self.pose = pose_of(scene, camera)
 
-    def move(self, kind: str, by: Sequence[float], begin: bool) -> None:
-        """Apply a move of MOVED. begin: True for the first move of a gesture, which `undo` undoes as a whole."""
-        self.put(MOVED[kind](self.pose, by), begin)
-
-    def put(self, pose: Pose, begin: bool = True) -> None:
-        if begin or not self._before:
-            self._before.append(self.pose)
-        self.pose = pose
+    def move(self, kind: str, by: Sequence[float]) -> None:
+        """Apply a move of MOVED."""
+        self.pose = MOVED[kind](self.pose, by)
 
     def change(self, **fields: Any) -> None:
-        """Change fields of the camera, such as fov_y. The changes of one field in a row are undone together."""
-        names, last = frozenset(fields), self._changed
-        more = last is not None and last[0] == names and last[1] is self.pose
-        self.put(replace(self.pose, camera=replace(self.pose.camera, **fields)), not more)
-        self._changed = names, self.pose
+        """Change fields of the camera, such as fov_y."""
+        self.pose = replace(self.pose, camera=replace(self.pose.camera, **fields))
 
-    def undo(self) -> None:
-        if self._before:
-            self.pose = self._before.pop()
+    def choose(self, name: str) -> None:
+        """Go to a camera of the scene."""
+        self.name, self.start = name, pose_of(self._scene, self._scene.cameras[self.names.index(name)])
+        self.reset()
 
     def reset(self) -> None:
-        if self.pose is not self.start:
-            self.put(self.start)
+        self.pose = self.start
 
 
 # --- scene files ------------------------------------------------------------------------------------------------------

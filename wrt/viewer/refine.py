@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -20,18 +20,116 @@ from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import auto_exposure, to_codes
 from wrt.renderer.options import Options, Progress
+from wrt.renderer.prepare import Prepared
+from wrt.renderer.render import Renderer
 from wrt.scene.cameras import CameraKind
+from wrt.scene.digest import digest
 from wrt.scene.model import Scene
-from wrt.scene.settings import Settings
-from wrt.viewer.renderers import CounterOf, Renderers, Shown, View
 
 COARSE = 0.08  # Target time of the first picture after a change, in seconds.
 PATIENCE = 0.5  # Seconds after which the next change interrupts even the first picture.
 EVERY = 0.25  # Seconds between two pictures while a view is refined.
 SCALES = (1, 2, 4, 8, 16, 32)  # Pixels of the view, along each side, for one pixel of a coarse picture.
-REST = 0.4  # Seconds from the last change of exposure or tone mapping until the picture counts as done again.
 DEEPEST = 12  # Largest max_depth that the user can choose, unless the scene's is larger.
 COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # Counters for heat maps.
+TILE_SIZE = 16  # Pixels a side; small, because the next view waits until all running tiles end.
+
+
+class Counter(Protocol):
+    """Counts the work of each pixel, such as visited nodes, for heat maps."""
+
+    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
+        """Set another camera and other settings, as Prepared.aimed does."""
+
+    def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
+        """Return an array (H, W) int32 for each counter, by its name. Return None once go_on(number of counted pixels) returns False."""
+
+
+CounterOf = Callable[[Prepared], Counter]
+Kind: TypeAlias = tuple[str, str, tuple[tuple[str, bool], ...]]  # name of the structure, kind of camera and its switches
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture or heat map that the user requests."""
+
+    camera: CameraKind
+    size: tuple[int, int]  # width, height in pixels at full resolution
+    max_depth: int
+    accel: str  # a name in ACCELERATORS
+    cost: str = ""  # the counter of a heat map, one of COSTS; "": the picture
+
+    def same(self, other: "View") -> bool:
+        """Return True if both views have the same pixels."""
+        fields, others = ((v.size, v.max_depth, v.accel, v.cost, digest(v.camera)) for v in (self, other))
+        return fields == others
+
+
+def kind_of(view: View) -> Kind:
+    """Return what two views must have in common to share a renderer. A lens is open in all of them (CameraKind.opened)."""
+    return view.accel, view.camera.kind, tuple(sorted(view.camera.opened().switches().items()))
+
+
+class Renderers:
+    """The renderers of a scene and their counters, by `kind_of` their views, made when a view first needs them.
+
+    progress: callback of all renderers. counter_of: makes the counter of a prepared scene; None: no heat maps."""
+
+    def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
+        self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
+        self.by_kind: dict[Kind, Renderer] = {}
+        self.counters: dict[Kind, Counter] = {}
+
+    def prepare(self, view: View) -> None:
+        """Make the renderer and the counter that the view needs, if they are missing. Raises InputError if that fails."""
+        kind = kind_of(view)
+        if kind not in self.by_kind:
+            options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE, progress=self.progress)
+            self.by_kind[kind] = Renderer(self.scene, options)
+        if view.cost and self.counter_of is not None and kind not in self.counters:
+            self.counters[kind] = self.counter_of(self.by_kind[kind].prepared)
+
+    def prepared(self, view: View) -> Prepared | None:
+        """Return the scene as prepared for the view; None before its structure is built."""
+        renderer = self.by_kind.get(kind_of(view))
+        return None if renderer is None else renderer.prepared
+
+    def picture(self, view: View, scale: int, spp: int) -> Film:
+        """Render the view with one pixel for each block of `scale` x `scale` pixels."""
+        renderer = self.by_kind[kind_of(view)]
+        renderer.aim(view.camera, view.size, **_settings(view, scale, spp))
+        return renderer.run()
+
+    def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
+        """Return Counter.costs of the view, with one pixel for each block of `scale` x `scale` pixels."""
+        counter = self.counters[kind_of(view)]
+        counter.aim(view.camera, view.size, **_settings(view, scale, 1))
+        return counter.costs(go_on)
+
+
+def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
+    width, height = (max(1, -(-side // scale)) for side in view.size)
+    return {"size": (width, height), "spp": spp, "max_depth": view.max_depth}
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture or heat map to show."""
+
+    codes: np.ndarray  # (h, w, 3) uint8, display values.
+    view: View
+    scale: int  # One pixel stands for scale x scale pixels of the view.
+    spp: int  # Smallest number of samples of a pixel.
+    speed: float = 0.0  # Rays per second.
+    rays_per_sample: float = 0.0  # Mean.
+    done: bool = False  # True: the picture gets no finer.
+    seconds_left: float = 0.0  # Until it is done, estimated.
+    error: float = np.inf  # Estimated root mean square, over pixels and channels, of the standard error; inf: unknown.
+    visibly_cut: float = 0.0  # As in Film.stats, of a finished picture.
+    # For a heat map, counts per pixel: the count shown in the last colour, the mean, and the largest count.
+    top: float = 0.0
+    mean: float = 0.0
+    largest: float = 0.0
 
 
 @dataclass(eq=False)
@@ -59,25 +157,6 @@ class Pace(dict[tuple[str, bool], float]):
         return [scale for scale in SCALES[::-1] if scale <= first]
 
 
-class Display:
-    """The settings exposure, tonemap and auto_exposure, applied to films."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-        self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
-
-    @property
-    def stops(self) -> float:
-        """The exposure of the last picture, in stops: with auto_exposure, `exposure` and the automatic stops."""
-        return self.settings.exposure + (self._automatic or 0.0 if self.settings.auto_exposure else 0.0)
-
-    def codes(self, film: Film, scale: int) -> np.ndarray:
-        """Return the display codes of a film. A coarse picture keeps the automatic exposure of the last fine one, so as not to flicker."""
-        if self.settings.auto_exposure and (scale == 1 or self._automatic is None):
-            self._automatic = auto_exposure(film.pixels)
-        return to_codes(film.pixels, self.stops, self.settings.tonemap)
-
-
 class Viewer:
     """Renders the view that `change` requested last. The caller runs `run` in a thread of its own, until `stop`.
 
@@ -93,25 +172,24 @@ class Viewer:
                  report: Callable[[str], None] = lambda text: None, spp: int = 1024, counter_of: CounterOf | None = None) -> None:
         self.scene, self.show, self.report, self.spp = scene, show, report, spp
         self.costs = () if counter_of is None else COSTS
-        settings = scene.settings
+        self.settings = scene.settings  # exposure, tonemap and auto_exposure are those of the pictures
         camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
-        self.deepest = max(settings.max_depth, DEEPEST)
-        self.view = View(camera, settings.size, settings.max_depth, options.accel)
-        self.display = Display(settings)
+        self.deepest = max(self.settings.max_depth, DEEPEST)
+        self.view = View(camera, self.settings.size, self.settings.max_depth, options.accel)
         self.shown: Shown | None = None  # the last picture
+        self.film: Film | None = None  # of `shown`, unless that is a heat map
         self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
+        self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
         self._pace = Pace()
         self._condition = threading.Condition()
         self._requested = self._completed = 0  # number of requests, and the last request that was rendered or abandoned
-        self._watched = self._redraw = self._retoned = self._stopped = False
-        self._toning = False  # True while exposure or tone mapping change; the picture then does not count as done
+        self._watched = self._redraw = self._stopped = False
         self._work: _Work | None = None
-        self._film: Film | None = None  # of `shown`, unless that is a heat map
 
     # --- from any thread ----------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> bool:
-        """Request the view with some fields of View changed. `camera` is a camera, or a function from the current camera to the new one.
+        """Request the view with some fields of View changed.
 
         Returns False if the view is watched and has the same pixels. Raises InputError for an unknown structure or counter."""
         if "accel" in changes:
@@ -119,8 +197,6 @@ class Viewer:
         if changes.get("cost"):
             require_known(changes["cost"], self.costs, "counter", "cost")
         with self._condition:
-            if callable(changes.get("camera")):
-                changes["camera"] = changes["camera"](self.view.camera)
             view = replace(self.view, **changes)
             if view.same(self.view) and self._watched:
                 return False
@@ -130,10 +206,9 @@ class Viewer:
             return True
 
     def tone(self, **changes: Any) -> None:
-        """Change exposure, tonemap or auto_exposure, without tracing a ray. Raises InputError for an invalid value."""
+        """Change exposure or tonemap, without tracing a ray. Raises InputError for an invalid value."""
         with self._condition:
-            self.display.settings = replace(self.display.settings, **changes)
-            self._retoned = True
+            self.settings = replace(self.settings, **changes)
         self.again()
 
     def again(self) -> None:
@@ -155,14 +230,6 @@ class Viewer:
             self._requested += 1
             self._condition.notify_all()
 
-    def picture(self) -> Film | np.ndarray | None:
-        """Return the last picture, to save it: a Film, or a heat map's display codes (h, w, 3) uint8; None before the first picture."""
-        with self._condition:
-            film, shown = self._film, self.shown
-        if film is None:
-            return None if shown is None else shown.codes
-        return replace(film, exposure=self.display.stops, tonemap=self.display.settings.tonemap)
-
     # --- the thread that renders --------------------------------------------------------------------------------------
 
     def run(self) -> None:
@@ -170,7 +237,7 @@ class Viewer:
         self._prepare(self.view)
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._stopped or self._redraw or self._pending, REST if self._toning else None)
+                self._condition.wait_for(lambda: self._stopped or self._redraw or self._pending)
             if self._stopped:
                 return
             self.step()
@@ -180,19 +247,16 @@ class Viewer:
         return self._watched and self._requested != self._completed
 
     def step(self) -> None:
-        """Render the requested view until it is done or the next request comes. If nothing is requested, show the last picture again.
-
-        While exposure or tone mapping change, the picture does not count as done, so that the page sends a smaller JPEG."""
+        """Render the requested view until it is done or the next request comes. If nothing is requested, show the last picture again."""
         with self._condition:
-            redraw, retoned, self._redraw, self._retoned = self._redraw, self._retoned, False, False
+            redraw, self._redraw = self._redraw, False
             work = _Work(self.view, self._requested) if self._pending else None
         if work is not None:
             self._refine(work)
             self._completed = work.request
-        elif self.shown is not None and (redraw or self._toning):
-            film = self._film
-            codes = self.shown.codes if film is None else self.display.codes(film, self.shown.scale)
-            self._put(replace(self.shown, codes=codes), film, rests=not retoned)
+        elif self.shown is not None and redraw:
+            codes = self.shown.codes if self.film is None else self._codes(self.film, self.shown.scale)
+            self._put(replace(self.shown, codes=codes), self.film)
 
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._requested != work.request:
@@ -246,16 +310,22 @@ class Viewer:
     def _show_film(self, work: _Work, film: Film, pace: tuple[int, float, float], done: bool = False) -> None:
         """Show a film. pace: number of rays, seconds so far, and seconds left."""
         rays, seconds, left = pace
-        self._put(Shown(self.display.codes(film, work.scale), work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
+        self._put(Shown(self._codes(film, work.scale), work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
                         rays / max(int(film.samples.sum()), 1), done, left, math.sqrt(float(film.variance.mean(dtype=np.float64))),
                         film.stats["visibly_cut"] if done else 0.0), film)
         work.last_shown = time.perf_counter()
 
-    def _put(self, shown: Shown, film: Film | None, rests: bool = True) -> None:
-        with self._condition:
-            self.shown, self._film = shown, film
-        self._toning = shown.done and not rests
-        self.show(shown if rests else replace(shown, done=False))
+    def _codes(self, film: Film, scale: int) -> np.ndarray:
+        """Return the display codes of a film. A coarse picture keeps the automatic exposure of the last fine one, so as not to flicker."""
+        settings = self.settings
+        if settings.auto_exposure and (scale == 1 or self._automatic is None):
+            self._automatic = auto_exposure(film.pixels)
+        automatic = self._automatic or 0.0 if settings.auto_exposure else 0.0
+        return to_codes(film.pixels, settings.exposure + automatic, settings.tonemap)
+
+    def _put(self, shown: Shown, film: Film | None) -> None:
+        self.shown, self.film = shown, film
+        self.show(shown)
 
     def _count(self, work: _Work) -> bool:
         """Render and show the heat map at work.scale; return False if it was abandoned."""

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import os
 import socket
 import sys
 import threading
@@ -22,18 +21,16 @@ from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject
 from wrt.viewer.access import Access, Place, Refused
-from wrt.viewer.messages import decoded
+from wrt.viewer.panel import decoded
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 LARGEST_MESSAGE = 1 << 16  # Bytes; a browser's messages have about a hundred.
-MOST_CONNECTIONS = 64  # Open at a time, with or without a token.
 LONGEST_LINE = 300  # Characters of a report.
-CONNECTING = 0  # The websockets.protocol.State of a connection before the handshake.
 CLOSING = 1.0  # Seconds that a browser has to close its WebSocket.
-QUIET = logging.getLogger("wrt.viewer.server.connections")  # Drops the errors of single connections.
+QUIET = logging.getLogger("wrt.viewer.server.connections")  # Drops the library's reports of malformed requests.
 QUIET.propagate = False
 QUIET.addHandler(logging.NullHandler())
 COMMON = {
@@ -44,16 +41,16 @@ COMMON = {
 
 
 class Answers(Protocol):
-    """What a Server serves. The server's thread calls all methods but `file`, so they must return soon."""
+    """What a Server serves. The server's thread calls all methods, so they must return soon."""
 
     def file(self, path: str) -> tuple[str, bytes] | None:
-        """Return the content type and the bytes of a file, or None for an unknown path. Called in a thread of its own."""
+        """Return the content type and the bytes of a file, or None for an unknown path."""
 
     def joined(self, browser: Browser) -> None: ...
 
     def left(self, browser: Browser) -> None: ...
 
-    def received(self, browser: Browser, message: JsonObject) -> None:
+    def received(self, message: JsonObject) -> None:
         """Act on a message, a JSON object. Raises Refused or InputError for a message that is not allowed."""
 
 
@@ -100,17 +97,13 @@ def listen(place: Place) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address, family=family)
     except (OSError, OverflowError, UnicodeError) as error:
-        number = getattr(error, "errno", None) or 0
-        reason = os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot listen on port {port} of {host} ({reason})",
+        raise InputError(f"cannot listen on port {port} of {host} ({getattr(error, 'strerror', None) or error})",
                          argument="port", hint="choose another with --port or --host") from error
 
 
 def to_stderr(text: str) -> None:
     """Write a line to stderr."""
-    if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):
-            print(text, file=sys.stderr, flush=True)
+    print(text, file=sys.stderr, flush=True)
 
 
 class Server:
@@ -120,9 +113,8 @@ class Server:
         import_websockets()
         self.access, self.answers, self.warn = access, answers, warn
         self.browsers: tuple[Browser, ...] = ()
-        self.connections: set[ServerConnection] = set()  # Open, with or without a token.
         self._reported: set[str] = set()
-        self._lock, self._ready = threading.Lock(), threading.Event()
+        self._ready = threading.Event()
         self.thread = threading.Thread(target=lambda: asyncio.run(self._serve(listening)), name="wrt viewer's server", daemon=True)
         self.thread.start()
         self._ready.wait()
@@ -130,27 +122,20 @@ class Server:
     def close(self) -> None:
         with contextlib.suppress(RuntimeError):  # the server has ended already
             self._loop.call_soon_threadsafe(self._ended.set)
-        self.thread.join()
+        self.thread.join(2.0 * CLOSING)  # longer only with a connection that sends no request
 
     def report(self, kind: str, text: str) -> None:
         """Pass a text to `warn` as one line, once for each kind."""
-        with self._lock:
-            if kind in self._reported:
-                return
+        if kind not in self._reported:
             self._reported.add(kind)
-        self.warn(f"viewer: {' '.join(text.split())[:LONGEST_LINE]} (reported once)")
+            self.warn(f"viewer: {' '.join(text.split())[:LONGEST_LINE]} (reported once)")
 
     async def _serve(self, listening: socket.socket) -> None:
         self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
-        self._loop.set_exception_handler(self._report_failure)
-        async with import_websockets().serve(
-                self._follow, sock=listening, process_request=self._answer, server_header=None, compression=None,
-                max_size=LARGEST_MESSAGE, close_timeout=CLOSING, logger=QUIET, create_connection=_checked_connection(self)):
+        async with import_websockets().serve(self._follow, sock=listening, process_request=self._answer, server_header=None,
+                                             compression=None, max_size=LARGEST_MESSAGE, close_timeout=CLOSING, logger=QUIET):
             self._ready.set()
             await self._ended.wait()
-            for connection in self.connections:  # the library would wait for connections without a request
-                if connection.protocol.state == CONNECTING:
-                    connection.transport.abort()
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None: the request opens a WebSocket."""
@@ -167,7 +152,7 @@ class Server:
             return None
         if location:
             return _response(HTTPStatus.SEE_OTHER, {"Location": location})
-        found = await asyncio.to_thread(self.answers.file, path)
+        found = self.answers.file(path)
         if found is None:
             return _response(HTTPStatus.NOT_FOUND)
         return _response(HTTPStatus.OK, {"Content-Type": found[0]}, found[1])
@@ -183,49 +168,19 @@ class Server:
             self.answers.joined(browser)
             async for data in connection:
                 try:
-                    self.answers.received(browser, decoded(data))
+                    self.answers.received(decoded(data))
                 except Refused as refused:
                     self.report(refused.kind, f"dropped {refused}")
                 except InputError as error:
                     self.report("action", f"error: {error}")
                 except Exception as error:  # a defect of the viewer; the library would drop it with the connection
-                    self._report_failure(self._loop, {"exception": error})
+                    self.report("failure", f"error: {type(error).__name__}: {error}")
         except ConnectionClosed:
             pass
         finally:
             sender.cancel()
             self.browsers = tuple(each for each in self.browsers if each is not browser)
             self.answers.left(browser)
-
-    def _report_failure(self, loop: object, context: dict[str, object]) -> None:
-        """Report an error in one line, in place of asyncio's traceback."""
-        error = context.get("exception")
-        text = context.get("message") if error is None else f"{type(error).__name__}: {error}"
-        self.report(f"failure {type(error).__name__}", f"error: {text}")
-
-    def accepts_another(self, connection: ServerConnection) -> bool:
-        if len(self.connections) < MOST_CONNECTIONS:
-            self.connections.add(connection)
-            return True
-        self.report("connections", f"closed a connection, because {MOST_CONNECTIONS} are open already")
-        return False
-
-
-def _checked_connection(server: Server) -> type[ServerConnection]:
-    """Return a class of connections that ends those above MOST_CONNECTIONS."""
-    from websockets.asyncio.server import ServerConnection
-
-    class Checked(ServerConnection):
-        def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            super().connection_made(transport)
-            if not server.accepts_another(self):
-                self.transport.abort()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            server.connections.discard(self)
-            super().connection_lost(exc)
-
-    return Checked
 
 
 def _response(status: HTTPStatus, headers: Mapping[str, str] = COMMON, body: bytes = b"") -> Response:

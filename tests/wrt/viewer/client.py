@@ -57,9 +57,9 @@ class Client:
     def open(self, width: int = 64, height: int = 48) -> None:
         self.send("size", width=width, height=height)
 
-    def move(self, angle: float, begin: bool = True) -> None:
+    def move(self, angle: float) -> None:
         """Orbit by an angle, as a drag over that share of the picture's height does."""
-        self.send("move", kind="orbit", by=[angle, 0.0, 0.0], begin=begin)
+        self.send("move", kind="orbit", by=[angle, 0.0, 0.0])
 
     def set(self, name: str, value: Any) -> None:
         self.send("set", name=name, value=value)

@@ -75,23 +75,6 @@ def test_an_interrupt_keeps_the_picture_so_far(shown: list[tuple[str, str]]) -> 
     assert picture_of(shown[-1][1]).shape == (34, 61, 3) and film._repr_png_().startswith(b"\x89PNG")
 
 
-def test_showing_leaves_time_for_rendering(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 100.0
-
-    def show(self: LiveView, progress: Progress) -> None:
-        nonlocal now
-        shown.append(("", ""))
-        now += 2.0  # showing takes 2 s, as with a large picture
-
-    monkeypatch.setattr("wrt.viewer.notebook.time.monotonic", lambda: now)
-    monkeypatch.setattr(LiveView, "_show", show)
-    view = LiveView(every=0.5)
-    for _ in range(50):
-        view(Progress(1, 2, 0, 0.0))
-        now += 1.0
-    assert len(shown) == 3  # 2 of 22 seconds
-
-
 def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.viewer.notebook.SHARE", 1e9)
     view = LiveView(every=0.0)

@@ -29,9 +29,7 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.viewer import refine as module
-from wrt.viewer import renderers
-from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Viewer
-from wrt.viewer.renderers import Shown
+from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Shown, Viewer
 
 # A box on a mirror, seen through an open lens, because the viewer always compiles a lens. All tests here share one kernel.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
@@ -74,7 +72,7 @@ def test_pictures_get_finer_and_end_with_that_of_render() -> None:
     scales = [shown.scale for shown in eye.pictures]
     assert scales[0] == 8 and scales == sorted(scales, reverse=True) and set(scales) == {8, 4, 2, 1}
     assert eye.pictures[0].codes.shape == (5, 8, 3) and not any(shown.done for shown in eye.pictures[:-1])
-    film = eye.viewer.picture()
+    film = eye.viewer.film
     assert isinstance(film, Film) and last.done and last.spp == 4
     expected = wrt.render(SCENE, spp=4)
     np.testing.assert_array_equal(film.pixels, expected.pixels)
@@ -123,21 +121,6 @@ def test_a_camera_that_never_rests_is_followed() -> None:
     assert len({shown.view for shown in eye.pictures}) == 6
 
 
-def test_a_slow_first_picture_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PATIENCE", -1.0)
-    eye = Eye()
-    eye.see(size=(61, 34))
-    (renderer,), pictures = eye.viewer.renderers.by_kind.values(), len(eye.pictures)
-
-    def report(progress: Any) -> None:
-        eye.viewer.change(camera=turned(5.0))
-        eye.viewer._on_progress(progress)
-
-    renderer.prepared.plan.options.progress = report
-    eye.see(camera=turned(1.0))
-    assert len(eye.pictures) == pictures
-
-
 def test_the_first_picture_is_as_fine_as_there_is_time_for() -> None:
     eye = Eye()
     view = replace(eye.viewer.view, size=(1280, 720))
@@ -183,19 +166,12 @@ def test_nothing_is_rendered_twice() -> None:
 def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     eye = Eye()
     eye.see(size=(61, 34))
-    film = eye.viewer.picture()
+    film = eye.viewer.film
     monkeypatch.setattr(Renderer, "run", lambda self: pytest.fail("rays were traced"))
     eye.viewer.tone(exposure=-1.5, tonemap="aces")
     eye.viewer.step()
-    assert isinstance(film, Film)
-    expected = replace(film, exposure=-1.5, tonemap="aces")
-    eye.viewer.step()  # without a further change
-    changing, rests = eye.pictures[-2:]
-    assert not changing.done and rests.done and eye.viewer.shown is not None and eye.viewer.shown.done
-    np.testing.assert_array_equal(changing.codes, expected.to_srgb8())
-    np.testing.assert_array_equal(rests.codes, expected.to_srgb8())
-    saved = eye.viewer.picture()
-    assert isinstance(saved, Film) and (saved.exposure, saved.tonemap) == (-1.5, "aces")
+    assert isinstance(film, Film) and eye.viewer.film is film and eye.pictures[-1].done
+    np.testing.assert_array_equal(eye.pictures[-1].codes, replace(film, exposure=-1.5, tonemap="aces").to_srgb8())
     with refused("tonemap", "must be one"):
         eye.viewer.tone(tonemap="sepia")
 
@@ -216,8 +192,8 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     shown = eye.see(size=(61, 34), cost="nodes")
     values = profile(SCENE, spp=1).maps["nodes"]
     assert shown.done and shown.mean == pytest.approx(values.mean()) and shown.largest == values.max()
-    codes = eye.viewer.picture()
-    assert isinstance(codes, np.ndarray) and codes.shape == (34, 61, 3)
+    codes = shown.codes
+    assert eye.viewer.film is None and codes.shape == (34, 61, 3)
     brightness = codes.astype(int).sum(axis=2)  # the colours of a heat map get lighter with the count
     below = values < shown.top
     order = np.argsort(values[below], kind="stable")
@@ -226,7 +202,7 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     eye.viewer._pace["bvh", True] = 1.0
     assert eye.see(cost="primitives").scale == SCALES[-1]  # finer scales were abandoned
     eye.viewer.step()
-    assert isinstance(eye.viewer.picture(), Film)
+    assert isinstance(eye.viewer.film, Film)
 
 
 def test_auto_exposure_is_that_of_render() -> None:
@@ -234,21 +210,9 @@ def test_auto_exposure_is_that_of_render() -> None:
     shown = eye.see(size=(61, 34))
     expected = wrt.render(SCENE, spp=4, exposure=0.5, auto_exposure=True)
     np.testing.assert_array_equal(shown.codes, expected.to_srgb8())
-    saved = eye.viewer.picture()
-    assert isinstance(saved, Film) and saved.exposure == pytest.approx(expected.exposure) != 0.5
     eye.viewer.tone(auto_exposure=False)
     eye.viewer.step()
     np.testing.assert_array_equal(eye.pictures[-1].codes, replace(expected, exposure=0.5).to_srgb8())
-
-
-def test_a_coarse_picture_keeps_the_automatic_exposure() -> None:
-    eye = Eye(SCENE.with_settings(auto_exposure=True))
-    eye.see(size=(61, 34))
-    stops, seen = eye.viewer.display.stops, list[float]()
-    eye.react = lambda shown: seen.append(eye.viewer.display.stops) if shown.scale > 1 else None
-    eye.viewer._pace["bvh", False] = 1.0
-    eye.see(camera=turned(120.0))
-    assert len(seen) >= 3 and set(seen) == {stops} and eye.viewer.display.stops != stops
 
 
 def test_a_target_error_ends_the_refinement() -> None:
@@ -271,7 +235,7 @@ def test_unknown_names_are_refused_and_build_errors_reported(monkeypatch: pytest
     def refuse(*arguments: Any) -> None:
         raise InputError("too many triangles")
 
-    monkeypatch.setattr(renderers, "Renderer", refuse)
+    monkeypatch.setattr(module, "Renderer", refuse)
     eye.see(accel="kdtree")
     assert eye.words[-1] == "error: too many triangles" and len(eye.pictures) == pictures
     assert eye.see(accel="bvh", max_depth=1).done and eye.words[-1] == ""

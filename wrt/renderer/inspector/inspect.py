@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
-from typing import Any, Unpack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import warp as wp
@@ -13,23 +13,73 @@ from wrt.accel.structure import WrappedStructure
 from wrt.core.checks import as_integer, as_tuple, shown, unknown
 from wrt.core.device import on_host, start
 from wrt.core.errors import InputError
-from wrt.core.types import Device
 from wrt.io.load import as_scene
 from wrt.kernels.loops import record
 from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.inspector.assemble import Assembler
-from wrt.renderer.inspector.inspection import Inspection
-from wrt.renderer.inspector.tree import Sample
+from wrt.renderer.inspector.tree import InspectedPixel, Sample
 from wrt.renderer.options import Options, PixelOptions
-from wrt.renderer.plan import Plan, plan_of
+from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import prepare
 from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS, SettingChanges
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from wrt.core.types import PathLike
+
 # The options of `render` that choose a pixel's bits, or how they are computed.
 OPTIONS = ("seed", "device", "threads", "accel", "accel_options", "triangle", "box", "instancing", "camera")
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection(InspectedPixel):
+    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
+
+    Parameters
+    ----------
+    scene
+        The inspected scene, with the settings of the inspection.
+    camera
+        The camera of the picture.
+    pixel, size
+        x and y from the top left; width and height of the picture.
+    seed
+        Seed of the samples.
+    samples
+        The inspected samples: all samples of the pixel, or one.
+    """
+
+    def figure(self, sample: int | None = None) -> Figure:
+        """Draw the rays of one sample in the plane that holds most of them, with the outlines of the shapes that it cuts.
+
+        Parameters
+        ----------
+        sample
+            Index of the sample to draw. None: the first.
+
+        Returns
+        -------
+        Figure
+            A figure of matplotlib, which a notebook shows, and `save` writes.
+
+        Raises
+        ------
+        InputError
+            If matplotlib is missing, the sample was not inspected, or it has no ray.
+        """
+        from wrt.renderer.inspector.drawing import figure  # without the drawing, an inspection imports less
+
+        return figure(self, sample)
+
+    def save(self, path: PathLike, sample: int | None = None) -> None:
+        """Write `figure(sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
+        from wrt.renderer.inspector.drawing import save
+
+        save(self, path, sample)
 
 
 def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int], sample: int | None = None,
@@ -72,8 +122,15 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
     return Inspector(scene, **keywords).pixel(pixel, sample)
 
 
+# The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
+ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
+          "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
+
+
 class Inspector:
-    """A prepared scene whose pixels are inspected one after another. The arguments are those of `inspect`."""
+    """A prepared scene whose pixels are inspected one after another. The arguments are those of `inspect`.
+
+    Its render kernel runs over a structure that records the rays (wrt.kernels.loops.record)."""
 
     def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[PixelOptions]) -> None:
         keywords: dict[str, Any] = {**options}
@@ -85,24 +142,40 @@ class Inspector:
         self.scene = as_scene(scene).with_settings(**changes)
         plan = plan_of(self.scene, resolved)
         self.camera, self.seed = plan.camera, resolved.seed
-        self._recorder = Recorder(plan, start(resolved.device))
-        self._assembler = Assembler(self.scene, self._recorder.prepared.arrays.world, plan.features)
+        features = replace(plan.features, recording=True)
+        recording = replace(plan, structure=WrappedStructure(plan.structure, record), features=features)
+        self._prepared = prepare(recording, start(resolved.device))
+        self._assembler = Assembler(self.scene, self._prepared.arrays.world, plan.features)
+        self._sizes = [size for _, size in ARRAYS.values()]
 
     def aim(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> None:
         """Set the camera and settings of the next inspections. The parameters are those of Prepared.aimed."""
-        self.scene, self.camera = self._recorder.aim(camera, **settings).scene, camera
+        self._prepared = self._prepared.aimed(camera, **settings)
+        self.scene, self.camera = self._prepared.plan.scene, camera
 
     def pixel(self, pixel: tuple[int, int], sample: int | None = None) -> Inspection:
         """Return the rays of a pixel. pixel, sample: as for `inspect`. Raises InputError if there is no such pixel or sample."""
         settings = self.scene.settings
         x, y = as_pixel(pixel, settings.size)
-        if sample is None:
-            indices = range(settings.spp)
-        else:
-            index = as_integer(sample, "sample", 0, settings.spp - 1)
-            indices = range(index, index + 1)
-        samples = tuple(Sample(i, self._assembler.tree(self._recorder.sample(x, y, i))) for i in indices)
+        indices = range(settings.spp) if sample is None else [as_integer(sample, "sample", 0, settings.spp - 1)]
+        samples = tuple(Sample(i, self._assembler.tree(self._records(x, y, i))) for i in indices)
         return Inspection(self.scene, self.camera, (x, y), settings.size, self.seed, samples)
+
+    def _records(self, x: int, y: int, index: int) -> dict[str, np.ndarray]:
+        """Trace one sample of a pixel; return a structured array for each array of Record, by name."""
+        plan, device = self._prepared.plan, self._prepared.device
+        while True:
+            accel = plan.structure.struct()
+            accel.accel = self._prepared.accel.data
+            accel.record.used = wp.zeros(len(ARRAYS), dtype=wp.int32, device=device)
+            for (name, (dtype, _)), size in zip(ARRAYS.items(), self._sizes, strict=True):
+                setattr(accel.record, name, wp.zeros(size, dtype=dtype, device=device))
+            film = DeviceFilm(plan.scene.settings, (x, y, x + 1, y + 1), device, plan.options.seed)
+            self._prepared.launch(film, accel)(Work((x, y, 1, 1), index, 1))
+            used = accel.record.used.numpy().tolist()
+            if all(n <= size for n, size in zip(used, self._sizes, strict=True)):
+                return {name: on_host(getattr(accel.record, name))[:n].copy() for name, n in zip(ARRAYS, used, strict=True)}
+            self._sizes = [max(n, size) for n, size in zip(used, self._sizes, strict=True)]
 
 
 def as_pixel(pixel: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
@@ -115,42 +188,3 @@ def as_pixel(pixel: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
         raise InputError(f"must be within the picture of {width}x{height}, x 0 to {width - 1} and y 0 to {height - 1}, got {x},{y}",
                          argument="pixel")
     return x, y
-
-
-# The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
-ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
-          "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
-
-
-class Recorder:
-    """A scene whose render kernel runs over a structure that records its rays (wrt.kernels.loops.record). plan: the plan of the render."""
-
-    def __init__(self, plan: Plan, device: Device) -> None:
-        features = replace(plan.features, recording=True)
-        self.prepared = prepare(replace(plan, structure=WrappedStructure(plan.structure, record), features=features), device)
-        self.sizes = [size for _, size in ARRAYS.values()]
-
-    def aim(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
-        """Set another camera and other settings, as Prepared.aimed does; return the plan with them."""
-        self.prepared = self.prepared.aimed(camera, **settings)
-        return self.prepared.plan
-
-    def film(self, x: int, y: int) -> DeviceFilm:
-        """Return an empty film of one pixel."""
-        plan = self.prepared.plan
-        return DeviceFilm(plan.scene.settings, (x, y, x + 1, y + 1), self.prepared.device, plan.options.seed)
-
-    def sample(self, x: int, y: int, index: int) -> dict[str, np.ndarray]:
-        """Trace one sample of a pixel; return a structured array for each array of Record, by name."""
-        device = self.prepared.device
-        while True:
-            accel = self.prepared.plan.structure.struct()
-            accel.accel = self.prepared.accel.data
-            accel.record.used = wp.zeros(len(ARRAYS), dtype=wp.int32, device=device)
-            for (name, (dtype, _)), size in zip(ARRAYS.items(), self.sizes, strict=True):
-                setattr(accel.record, name, wp.zeros(size, dtype=dtype, device=device))
-            self.prepared.launch(self.film(x, y), accel)(Work((x, y, 1, 1), index, 1))
-            used = accel.record.used.numpy().tolist()
-            if all(n <= size for n, size in zip(used, self.sizes, strict=True)):
-                return {name: on_host(getattr(accel.record, name))[:n].copy() for name, n in zip(ARRAYS, used, strict=True)}
-            self.sizes = [max(n, size) for n, size in zip(used, self.sizes, strict=True)]

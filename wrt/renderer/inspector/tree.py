@@ -1,5 +1,6 @@
-"""The tree of rays of a pixel: InspectedPixel, Sample, Ray, Light and Place. A pixel is a mean of samples, a sample a sum over rays."""
+"""The tree of rays of a pixel, and its text. A pixel is a mean of samples, and a sample is a sum over rays."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from wrt.scene.cameras import CameraKind
     from wrt.scene.model import Scene
 
+MOST = 4  # samples that are printed
 AMBIENT = "ambient term"  # name of the light that stands for the ambient term, with ambient occlusion
 
 
@@ -121,7 +123,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class InspectedPixel:
-    """The data of an Inspection, which documents the fields."""
+    """The data of an Inspection (wrt.renderer.inspector.inspect), which documents the fields."""
 
     scene: "Scene" = field(repr=False)
     camera: "CameraKind" = field(repr=False)
@@ -145,6 +147,19 @@ class InspectedPixel:
                     radiance = (limit / radiance.max()) * radiance
                 mean = mean + (radiance - mean) / np.float32(n)
         return mean
+
+    def __str__(self) -> str:
+        """Return the trees of the first MOST samples, one line for each ray and each light, below a line with the pixel's radiance."""
+        (x, y), (width, height), samples = self.pixel, self.size, self.samples
+        of = f"sample {samples[0].index}" if len(samples) == 1 else f"the mean of {len(samples)} samples"
+        lines = [f"pixel {x},{y} of {width}x{height}, {self.scene.name or 'scene'}: radiance {color(self.radiance)}, {of}"]
+        for sample in samples[:MOST]:
+            if len(samples) > 1:
+                lines.append(f"sample {sample.index}: radiance {color(sample.radiance)}")
+            lines += ["the camera has no ray here"] if sample.root is None else ray_lines(sample.root, "", "")
+        if len(samples) > MOST:
+            lines.append(f"and {len(samples) - MOST} more samples")
+        return "\n".join(lines)
 
     def to_dict(self) -> JsonObject:
         """Return the samples as a JSON object: the fields of Inspection, Sample, Ray and Light, with rays as a flat list.
@@ -170,3 +185,45 @@ def _plain(value: object) -> object:
     if isinstance(value, tuple):
         return [{each.name: _plain(getattr(part, each.name)) for each in fields(part)} for part in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+# --- text ----------------------------------------------------------------------------------------------------------------
+
+
+def ray_lines(ray: Ray, first: str, below: str) -> Iterator[str]:
+    """Yield the lines of a ray and of everything that begins at its hit. first, below: indents of the first line and of the others."""
+    waiting: list[tuple[Ray | Light, str, str]] = [(ray, first, below)]
+    while waiting:
+        item, first, below = waiting.pop()
+        yield first + (describe_ray(item) if isinstance(item, Ray) else describe_light(item))
+        items: tuple[Ray | Light, ...] = (*item.lights, *item.children) if isinstance(item, Ray) else ()
+        waiting += [(each, below + ("└─ " if last else "├─ "), below + ("   " if last else "│  "))
+                    for each, last in zip(items[::-1], [True] + [False] * (len(items) - 1), strict=False)]
+
+
+def describe_ray(ray: Ray) -> str:
+    through = "" if ray.kind == "camera" else f", throughput {color(ray.throughput)}"
+    if ray.ended.startswith("cut"):
+        return f"{ray.kind}{through}: {ray.ended}"
+    if ray.ended == "missed":
+        return f"{ray.kind}{through}: missed, background adds {color(ray.radiance)}"
+    end = {"emission": ", ends at its emission", "absorbed": ", ends here"}.get(ray.ended, "")
+    adds = f", adds {color(ray.radiance)}" if ray.radiance.any() else ""
+    return f"{ray.kind}{through}: t {ray.t:.4g}, {at(ray)}{'' if ray.front else ' from behind'}{adds}{end}"
+
+
+def describe_light(light: Light) -> str:
+    stops = [part for part in light.parts if math.isfinite(part.t)]
+    by = ", ".join(f"{at(part)} at {part.t * float(np.linalg.norm(part.direction)):.4g}" for part in stops)
+    by = f" by {by}" if by else ""
+    adds = f", reflects {color(light.radiance)}" if light.radiance.any() else ""
+    return f"light {light.light}: {light.state}{by}{adds}"
+
+
+def at(place: Place) -> str:
+    return f"{place.object} ({place.material})" if place.material else place.object
+
+
+def color(value: np.ndarray) -> str:
+    """Return the three components, or one number if they are equal."""
+    return f"{value[0]:.4g}" if value[0] == value[1] == value[2] else " ".join(f"{each:.4g}" for each in value)
