@@ -48,7 +48,6 @@ assert not {"scipy", "PIL", "click"} & set(sys.modules)
 """
 # Calls that need more, and the messages.
 REFUSED = {
-    "wrt.load_scene('box.glb')": "box.glb: a glTF file needs pygltflib; pip install pygltflib",
     "wrt.Mesh.from_trimesh(7)": "a mesh of trimesh needs trimesh; pip install trimesh",
     "wrt.load_mesh('box.obj').to_trimesh()": "a mesh of trimesh needs trimesh; pip install trimesh",
     "wrt.compat.trimesh": "wrt.compat.trimesh needs trimesh; pip install trimesh",
@@ -73,7 +72,6 @@ def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "box.obj").write_text(BOX_OBJ)
     (tmp_path / "bent.obj").write_text(BENT_OBJ)
-    (tmp_path / "box.glb").write_bytes(b"glTF")
     return tmp_path
 
 

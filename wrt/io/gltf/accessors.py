@@ -57,7 +57,7 @@ class Accessors:
             raise InputError(f"must be 1 to {most}, got {count}", place=f"{where}.count")
         width = _WIDTHS[accessor.type]
         if accessor.bufferView is not None:
-            array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
+            array = self._elements(accessor.bufferView, accessor.byteOffset, dtype, (count, width), where)
         else:  # zeros, by the specification
             array = np.zeros((count, width), dtype)
         if accessor.sparse is not None:
@@ -88,12 +88,12 @@ class Accessors:
         index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
         if index_type.kind != "u":
             raise InputError("must be an unsigned integer type", place=f"{where}.indices.componentType")
-        rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset or 0, index_type, (sparse.count, 1),
+        rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset, index_type, (sparse.count, 1),
                               f"{where}.indices")[:, 0]
         if rows.max() >= len(array):
             raise InputError(f"holds the index {int(rows.max())}, but there are {len(array)} elements", place=f"{where}.indices")
         values = sparse.values
-        array[rows] = self._elements(values.bufferView, values.byteOffset or 0, array.dtype.newbyteorder("<"),
+        array[rows] = self._elements(values.bufferView, values.byteOffset, array.dtype.newbyteorder("<"),
                                      (sparse.count, array.shape[1]), f"{where}.values")
         return array
 

@@ -1,6 +1,7 @@
 """A glTF 2.0 file: the container (.gltf, .glb), its JSON, its buffers and the files that it refers to.
 
-Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB).
+Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB); EXT_meshopt_compression and
+KHR_meshopt_compression. A file that does not require these two has plain buffers, which wrt reads instead.
 """
 
 import base64
@@ -9,7 +10,7 @@ import re
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
@@ -19,20 +20,15 @@ from wrt.core.errors import InputError, at
 from wrt.core.files import read_file, utf8
 from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject, PathLike
-from wrt.io.gltf import meshopt
-from wrt.io.gltf.schema import MeshoptView, item_type, read_as
+from wrt.io.gltf.schema import EXTENSIONS, FILE, ITEMS, read
 
-T = TypeVar("T")
-GltfObject: TypeAlias = Any  # a dataclass of pygltflib, which has no types
+GltfObject: TypeAlias = Any  # a namespace with the keys that wrt.io.gltf.schema declares
 GLB_MAGIC = b"glTF"
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
+MESHOPT = ("KHR_meshopt_compression", "EXT_meshopt_compression")
+_MOST = 1024  # bytes for which one byte of meshopt's data can stand: four columns of a block of 256 vertices, if all are 0
 
-SUPPORTED_EXTENSIONS = frozenset({
-    "KHR_lights_punctual", "KHR_draco_mesh_compression", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
-    "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
-    "KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_pbrSpecularGlossiness",
-    "KHR_node_visibility", "EXT_texture_webp", "EXT_texture_avif", *meshopt.NAMES,
-})
+SUPPORTED_EXTENSIONS = frozenset({*EXTENSIONS, "KHR_mesh_quantization"})
 # Extensions that describe the file or its use, and change no pixel.
 METADATA_EXTENSIONS = frozenset({
     "KHR_xmp", "KHR_xmp_json_ld", "KHR_animation_pointer", "KHR_interactivity", "KHR_node_selectability",
@@ -89,20 +85,17 @@ class LeftOut:
 class Document:
     """JSON of a file, typed where it is read, and the bytes that it refers to. The caller adds the path to each InputError.
 
-    gltf: a pygltflib.GLTF2 without its arrays, whose items `item` returns. shapes_only: accept files that require extensions of
+    gltf: the file's object without its arrays, whose items `item` returns. shapes_only: accept files that require extensions of
     materials, textures and lights. left_out: what wrt does not support; mistakes: what is wrong in the file and is left out or changed."""
 
     def __init__(self, path: PathLike, shapes_only: bool = False) -> None:
-        with needed_by("a glTF file"):
-            import pygltflib
-
         self.path = Path(path)
         raw, self._binary = _read_container(self.path)
         if not isinstance(raw, dict):
             raise InputError("is not a glTF file: its JSON is not an object")
         _check_version(raw)
         self._raw, self._items = raw, dict[tuple[str, int], GltfObject]()
-        self.gltf: Any = read_as(pygltflib.GLTF2, raw, "")
+        self.gltf: GltfObject = read(FILE, raw, "")
         _check_required_extensions(each for each in self.gltf.extensionsRequired if not (shapes_only and each.startswith(_LOOKS)))
         self.left_out, self.mistakes = LeftOut(), LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
@@ -123,30 +116,33 @@ class Document:
         if not 0 <= index < len(items):
             raise InputError(f"is {index}, but there are {len(items)} {array}", place=place)
         if (array, index) not in self._items:
-            self._items[array, index] = read_as(item_type(array), items[index], f"{array}[{index}]")
+            self._items[array, index] = read(ITEMS[array], items[index], f"{array}[{index}]")
         return self._items[array, index]
 
-    def extension(self, holder: GltfObject, name: str, cls: type[T], place: str) -> T | None:
-        """Return the extension `name` of a glTF object as an instance of `cls`, or None."""
-        raw = (holder.extensions or {}).get(name)
-        return None if raw is None else read_as(cls, raw, f"{place}.extensions.{name}".removeprefix("."))
+    def extension(self, holder: GltfObject, name: str, place: str) -> GltfObject | None:
+        """Return the extension `name` of a glTF object, or None."""
+        raw = holder.extensions.get(name)
+        return None if raw is None else read(EXTENSIONS[name], raw, f"{place}.extensions.{name}")
+
+    def extension_or_defaults(self, holder: GltfObject, name: str, place: str) -> GltfObject:
+        return self.extension(holder, name, place) or read(EXTENSIONS[name], {}, "")
 
     def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
         """Return the bytes (N,) uint8 of a buffer view, and its stride in bytes or None."""
         view, where = self.item("bufferViews", index, place), f"bufferViews[{index}]"
-        for name in meshopt.NAMES:
-            compressed = self.extension(view, name, MeshoptView, where) if name in (self.gltf.extensionsRequired or ()) else None
+        for name in MESHOPT:
+            compressed = self.extension(view, name, where) if name in self.gltf.extensionsRequired else None
             if compressed is not None:
                 if index not in self._decoded:
                     inside = f"{where}.extensions.{name}"
-                    self._decoded[index] = meshopt.decode(self._slice(compressed, inside), compressed, view.byteLength, inside)
+                    self._decoded[index] = _decode_meshopt(self._slice(compressed, inside), compressed, view.byteLength, inside)
                 return self._decoded[index], view.byteStride
         return self._slice(view, where), view.byteStride
 
     def _slice(self, view: GltfObject, where: str) -> np.ndarray:
         """Return the bytes of a buffer from `byteOffset` on."""
         data = self._buffer(view.buffer, f"{where}.buffer")
-        start, length = view.byteOffset or 0, view.byteLength
+        start, length = view.byteOffset, view.byteLength
         if length < 1:
             raise InputError(f"must be at least 1, got {length}", place=f"{where}.byteLength")
         if start < 0 or start + length > len(data):
@@ -180,6 +176,23 @@ class Document:
             return read_file(self.path.parent / name)
         except InputError as error:
             raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", place=place) from None
+
+
+def _decode_meshopt(data: np.ndarray, view: GltfObject, length: int, place: str) -> np.ndarray:
+    """Return the `length` bytes (N,) uint8 of a buffer view that meshoptimizer compressed to `data`.
+
+    Raises InputError if meshopt is missing, or if the data are damaged or do not have this length."""
+    if view.count < 1 or view.count * view.byteStride != length:
+        raise InputError(f"{view.count} elements of {view.byteStride} bytes do not fill the {length} bytes of the buffer view", place=place)
+    if length > _MOST * len(data):
+        raise InputError(f"{len(data)} bytes of data are too few for {length}", place=place)
+    with needed_by("a glTF file with meshopt compression"):
+        import meshopt
+    try:
+        decoded = meshopt.decode_gltf_buffer(data.tobytes(), view.count, view.byteStride, view.mode, view.filter)
+    except ValueError as error:
+        raise InputError(f"is not data that meshoptimizer compressed ({error})", place=place) from error
+    return decoded.reshape(-1).view(np.uint8)
 
 
 def _read_container(path: Path) -> tuple[object, bytes | memoryview | None]:
@@ -217,7 +230,7 @@ def _read_glb(data: bytes) -> tuple[object, bytes | memoryview | None]:
 
 def _parse_json(data: bytes) -> object:
     try:
-        return json.loads(utf8(data).decode())  # with NaN and Infinity, which `read_as` refuses where they are used
+        return json.loads(utf8(data).decode())  # with NaN and Infinity, which `read` refuses where they are used
     except UnicodeDecodeError as error:
         raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
     except RecursionError:

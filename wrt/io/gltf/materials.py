@@ -14,19 +14,7 @@ import numpy as np
 from wrt.core.checks import LARGEST, short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document, GltfObject
-from wrt.io.gltf.schema import (
-    Clearcoat,
-    EmissiveStrength,
-    Ior,
-    Specular,
-    SpecularGlossiness,
-    TextureSource,
-    TextureTransform,
-    Transmission,
-    Unlit,
-    Volume,
-    exactly,
-)
+from wrt.io.gltf.schema import ITEMS, read
 from wrt.picture.decode import decode_rgba8
 from wrt.scene.kinds import forms
 from wrt.scene.materials import Material, Texture
@@ -74,16 +62,16 @@ class Textures:
         document = self._document
         texture = document.item("textures", info.index, f"{place}.index")
         document.left_out.add_extensions(info.extensions, "material", material)
-        transform = document.extension(info, "KHR_texture_transform", TextureTransform, place) or TextureTransform()
-        coordinates = transform.texCoord if transform.texCoord is not None else info.texCoord or 0
+        transform = document.extension_or_defaults(info, "KHR_texture_transform", place)
+        coordinates = transform.texCoord if transform.texCoord is not None else info.texCoord
         if coordinates != 0:
             document.left_out.add(f"textures by TEXCOORD_{coordinates}", "material", material)
             return None
         wrap = self._wrap(texture, material, f"textures[{info.index}]")
-        matrix = _uv_transform(transform, f"{place}.extensions.KHR_texture_transform")
+        matrix = _uv_transform(transform)
         source = self._source(texture, f"textures[{info.index}]")
         if source is None:
-            others = ", ".join(map(short, texture.extensions or ()))
+            others = ", ".join(map(short, texture.extensions))
             document.left_out.add(f"textures whose only image is that of {others}" if others else "textures without an image",
                                   "material", material)
             return None
@@ -125,7 +113,7 @@ class Textures:
         source = texture.source
         for name in ("EXT_texture_webp", "EXT_texture_avif"):
             if source is None:
-                extension = self._document.extension(texture, name, TextureSource, place)
+                extension = self._document.extension(texture, name, place)
                 source = extension.source if extension else None
         if source is not None:
             self._document.item("images", source, f"{place}.source")
@@ -148,13 +136,12 @@ class Textures:
         return self._images[index]
 
 
-def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
+def _uv_transform(transform: GltfObject) -> np.ndarray:
     """Return the (2, 3) matrix that scales, then rotates, then offsets (u, v, 1).
 
     A positive rotation is counter-clockwise in the image, with v downwards, as in the prose, the example and the sample models of
     KHR_texture_transform. The GLSL listing in that specification rotates the other way."""
-    offset_u, offset_v = exactly(transform.offset, 2, f"{place}.offset")
-    scale_u, scale_v = exactly(transform.scale, 2, f"{place}.scale")
+    (offset_u, offset_v), (scale_u, scale_v) = transform.offset, transform.scale
     cosine, sine = math.cos(transform.rotation), math.sin(transform.rotation)
     return np.array([[cosine * scale_u, sine * scale_v, offset_u], [-sine * scale_u, cosine * scale_v, offset_v]])
 
@@ -179,17 +166,15 @@ class Materials:
         return self._materials[index]
 
     def _make(self, source: GltfObject, name: str, place: str) -> Material:
-        import pygltflib
-
-        for extension, raw in (source.extensions or {}).items():
+        for extension, raw in source.extensions.items():
             neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
             if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
                 self._document.left_out.add_extensions({extension: raw}, "material", name)
-        glossy = self._document.extension(source, _GLOSSY, SpecularGlossiness, place)
-        if source.pbrMetallicRoughness is None or glossy is not None:
-            source.pbrMetallicRoughness = pygltflib.PbrMetallicRoughness()
+        glossy = self._document.extension(source, _GLOSSY, place)
+        if glossy is not None:
+            source.pbrMetallicRoughness = read(ITEMS["materials"], {}, "").pbrMetallicRoughness
         fields = self._clamped(self._base(source, glossy, name, place), name)
-        if self._document.extension(source, "KHR_materials_unlit", Unlit, place) is not None:
+        if self._document.extension(source, "KHR_materials_unlit", place) is not None:
             fields = _unlit(fields)
         else:
             fields |= {"kind": "metallic_roughness"} | self._reflection(source, name, place)
@@ -204,16 +189,15 @@ class Materials:
         return {key: self._document.mistakes.clamp(value, *_LIMITS[key], key, "material", name) if key in _LIMITS else value
                 for key, value in fields.items()}
 
-    def _base(self, source: GltfObject, glossy: SpecularGlossiness | None, name: str, place: str) -> dict[str, Any]:
+    def _base(self, source: GltfObject, glossy: GltfObject | None, name: str, place: str) -> dict[str, Any]:
         """Return the fields that lit and unlit materials share: name, base colour or diffuse colour, alpha and sides."""
         pbr, color = source.pbrMetallicRoughness, f"{place}.pbrMetallicRoughness.baseColor"
         factor, texture = pbr.baseColorFactor, pbr.baseColorTexture
         if glossy is not None:
             factor, texture, color = glossy.diffuseFactor, glossy.diffuseTexture, f"{place}.extensions.{_GLOSSY}.diffuse"
-        factor = exactly(factor, 4, f"{color}Factor")
         if source.alphaMode not in _ALPHA_MODES:
             raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}", place=f"{place}.alphaMode")
-        alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
+        alpha, cutoff = factor[3], source.alphaCutoff
         if cutoff > 1.0:  # allowed; the surface is then invisible
             alpha, cutoff = 0.0, 1.0
         return {
@@ -234,16 +218,16 @@ class Materials:
 
     def _transmission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         """Return the fields of glass: a thin pane, or solid glass if KHR_materials_volume gives a thickness above 0."""
-        transmission = self._document.extension(source, "KHR_materials_transmission", Transmission, place)
-        if transmission is None or transmission.transmissionFactor == 0.0:
+        transmission = self._document.extension_or_defaults(source, "KHR_materials_transmission", place)
+        if transmission.transmissionFactor == 0.0:
             return {}
         fields: dict[str, Any] = {"transmission": transmission.transmissionFactor, "thin": True}
         fields["transmission_texture"] = self._textures.texture(
             transmission.transmissionTexture, False, name, f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
-        volume = self._document.extension(source, "KHR_materials_volume", Volume, place)
-        if volume is not None and volume.thicknessFactor > 0.0:
-            color, clamp = f"{place}.extensions.KHR_materials_volume.attenuationColor", self._document.mistakes.clamp
-            volume.attenuationColor = clamp(exactly(volume.attenuationColor, 3, color), 0.0, 1.0, "attenuationColor", "material", name)
+        volume = self._document.extension_or_defaults(source, "KHR_materials_volume", place)
+        if volume.thicknessFactor > 0.0:
+            clamp = self._document.mistakes.clamp
+            volume.attenuationColor = clamp(volume.attenuationColor, 0.0, 1.0, "attenuationColor", "material", name)
             if volume.attenuationDistance <= 0.0:
                 self._document.mistakes.add("attenuationDistance of 0, now infinite", "material", name)
             fields |= {"thin": False, "absorption": absorption(volume)}
@@ -251,24 +235,23 @@ class Materials:
 
     def _specular(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         """Return the index and the factors on its reflectance. An index of 0 means the reflectance 1 times these factors."""
-        ior = (self._document.extension(source, "KHR_materials_ior", Ior, place) or Ior()).ior
-        specular = self._document.extension(source, "KHR_materials_specular", Specular, place) or Specular()
+        ior = self._document.extension_or_defaults(source, "KHR_materials_ior", place).ior
+        specular = self._document.extension_or_defaults(source, "KHR_materials_specular", place)
         place = f"{place}.extensions.KHR_materials_specular"
-        color = exactly(specular.specularColorFactor, 3, f"{place}.specularColorFactor")
         return {
             "ior": ior or 1.5, "specular_factor": specular.specularFactor,
-            "specular_color": tuple((1.0 if ior else _FULL_REFLECTANCE) * channel for channel in color),
+            "specular_color": tuple((1.0 if ior else _FULL_REFLECTANCE) * channel for channel in specular.specularColorFactor),
             "specular_texture": self._textures.texture(specular.specularTexture, False, name, f"{place}.specularTexture"),
             "specular_color_texture": self._textures.texture(specular.specularColorTexture, True, name, f"{place}.specularColorTexture"),
         }
 
-    def _glossy(self, glossy: SpecularGlossiness, name: str, place: str) -> dict[str, Any]:
+    def _glossy(self, glossy: GltfObject, name: str, place: str) -> dict[str, Any]:
         """Return the fields of a surface that has the specular colour as its reflectance at normal incidence.
 
         Where the specification multiplies the diffuse colour by 1 - max(specular), wrt multiplies it by 1 - F, F being the largest
         channel of the reflectance at each angle: the same at normal incidence."""
         clamp = self._document.mistakes.clamp
-        specular = clamp(exactly(glossy.specularFactor, 3, f"{place}.specularFactor"), 0.0, 1.0, "specularFactor", "material", name)
+        specular = clamp(glossy.specularFactor, 0.0, 1.0, "specularFactor", "material", name)
         glossiness = clamp(glossy.glossinessFactor, 0.0, 1.0, "glossinessFactor", "material", name)
         texture = self._textures.texture(glossy.specularGlossinessTexture, True, name, f"{place}.specularGlossinessTexture")
         return {
@@ -279,8 +262,8 @@ class Materials:
         }
 
     def _clearcoat(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        coat = self._document.extension(source, "KHR_materials_clearcoat", Clearcoat, place)
-        if coat is None or coat.clearcoatFactor == 0.0:
+        coat = self._document.extension_or_defaults(source, "KHR_materials_clearcoat", place)
+        if coat.clearcoatFactor == 0.0:
             return {}
         place = f"{place}.extensions.KHR_materials_clearcoat"
         if coat.clearcoatNormalTexture is not None:
@@ -293,9 +276,8 @@ class Materials:
         }
 
     def _emission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        factor = exactly(source.emissiveFactor, 3, f"{place}.emissiveFactor")
-        strength = self._document.extension(source, "KHR_materials_emissive_strength", EmissiveStrength, place)
-        emission = tuple(value * (strength.emissiveStrength if strength else 1.0) for value in factor)
+        strength = self._document.extension_or_defaults(source, "KHR_materials_emissive_strength", place).emissiveStrength
+        emission = tuple(value * strength for value in source.emissiveFactor)
         if not any(emission):
             return {}
         if source.emissiveTexture is None:
@@ -306,7 +288,7 @@ class Materials:
         return {"emission": emission, "emission_texture": texture}
 
 
-def absorption(volume: Volume) -> Color:
+def absorption(volume: GltfObject) -> Color:
     """Return the coefficient a (Beer-Lambert) per unit of world length: exp(-a attenuationDistance) is the attenuationColor."""
     if math.isinf(volume.attenuationDistance) or volume.attenuationDistance <= 0.0:
         return BLACK

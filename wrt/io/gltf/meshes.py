@@ -1,20 +1,19 @@
 """Meshes of a glTF file, and instances of its nodes.
 
-Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, KHR_mesh_quantization.
+Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, KHR_mesh_quantization, KHR_draco_mesh_compression. A file
+that does not require Draco has plain accessors, which wrt reads instead.
 """
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
+from wrt.core.packages import needed_by
 from wrt.io.gltf.accessors import Accessors, require_finite
 from wrt.io.gltf.document import Document, GltfObject
-from wrt.io.gltf.draco import decode
-from wrt.io.gltf.nodes import compose
-from wrt.io.gltf.schema import Instancing
-from wrt.io.gltf.skins import Skins, moved
+from wrt.io.gltf.nodes import Skins, compose, moved
 from wrt.io.polygons import strip
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
@@ -44,6 +43,9 @@ Targets: TypeAlias = list[tuple[float, dict[str, int]]]  # morph targets with th
 TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: strip, 6: _fan}
 _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
+DRACO = "KHR_draco_mesh_compression"
+READ_FROM_DRACO = ("POSITION", "NORMAL", "TEXCOORD_0", "JOINTS_", "WEIGHTS_")
+
 
 class Meshes:
     """Cache of meshes: primitives with the same accessors, mode, weights of morph targets and skin share a Mesh."""
@@ -68,7 +70,7 @@ class Meshes:
         for attribute in sorted(attributes):
             if not attribute.startswith(_NO_WARNING):
                 left_out.add(attribute, "mesh", name)
-        targets = [(weight, target) for weight, target in zip(weights, primitive.targets or (), strict=False) if weight]
+        targets = [(weight, target) for weight, target in zip(weights, primitive.targets, strict=False) if weight]
         key = (*(attributes.get(a) for a in ("POSITION", "NORMAL", "TEXCOORD_0")), primitive.indices, primitive.mode,
                *((weight, *sorted(target.items())) for weight, target in targets),
                *((skin, *sorted(attributes.items())) if skin is not None else ()))
@@ -79,7 +81,7 @@ class Meshes:
         return self._meshes[key]
 
     def _make(self, primitive: GltfObject, name: str, place: str, targets: Targets, skin: int | None) -> Mesh | None:
-        mode = decode(self._document, self._accessors, primitive, place)
+        mode = _decode_draco(self._document, self._accessors, primitive, place)
         positions = self._attribute(primitive, "POSITION", "VEC3", place, targets)
         indices = self._indices(primitive, len(positions), place)
         require_finite(positions, f"{place}.attributes.POSITION: accessors[{primitive.attributes['POSITION']}]", indices)
@@ -144,7 +146,7 @@ class Meshes:
 
     def instances(self, node: GltfObject, place: str) -> np.ndarray | None:
         """Return the transforms (N, 4, 4) of a node's instances, instance to node, or None if the node has no instances."""
-        instancing = self._document.extension(node, "EXT_mesh_gpu_instancing", Instancing, place)
+        instancing = self._document.extension(node, "EXT_mesh_gpu_instancing", place)
         if instancing is None:
             return None
         place = f"{place}.extensions.EXT_mesh_gpu_instancing.attributes"
@@ -162,3 +164,34 @@ class Meshes:
             require_count(self._instances, "instances")
         return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
                          for name, (_, default) in wanted.items()))
+
+
+def _decode_draco(document: Document, accessors: Accessors, primitive: GltfObject, place: str) -> int:
+    """Decode a compressed primitive into its accessors. Return its mode, which is 4 (a list of triangles) for every compressed primitive.
+
+    Raises InputError if DracoPy is missing, or if the data are damaged or do not fit the accessors."""
+    compressed = document.extension(primitive, DRACO, place)
+    if compressed is None or DRACO not in document.gltf.extensionsRequired:
+        return int(primitive.mode)
+    where = f"{place}.extensions.{DRACO}"
+    if primitive.mode not in (4, 5) or primitive.indices is None:
+        raise InputError("must be a list or a strip of triangles (mode 4 or 5) with indices", place=place)
+    with needed_by("a glTF file with Draco compression"):
+        import DracoPy
+    data, _ = document.view(compressed.bufferView, f"{where}.bufferView")
+    try:
+        mesh: Any = DracoPy.decode(data.tobytes())
+        faces, arrays = mesh.faces, {each["unique_id"]: each["data"] for each in mesh.attributes}
+    except Exception as error:  # DracoPy's own classes; AttributeError for a point cloud
+        raise InputError(f"is not a mesh that Draco compressed ({error})", place=where) from error
+    if primitive.mode == 5:  # the count is that of a strip, but Draco holds triangles
+        document.item("accessors", primitive.indices, f"{place}.indices").count = faces.size
+    accessors.put(primitive.indices, faces.reshape(-1, 1), f"{place}.indices")
+    for name, unique_id in compressed.attributes.items():
+        if not name.startswith(READ_FROM_DRACO):
+            continue
+        if unique_id not in arrays or name not in primitive.attributes:
+            raise InputError("must be an attribute of the primitive and of the compressed mesh", place=f"{where}.attributes.{name}")
+        array = arrays[unique_id]
+        accessors.put(primitive.attributes[name], array.reshape(len(array), -1), f"{place}.attributes.{name}")
+    return 4

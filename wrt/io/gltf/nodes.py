@@ -1,12 +1,17 @@
-"""The node graph of a glTF file, and the transforms of its nodes. Source: Khronos, glTF 2.0 specification, section 3.5."""
+"""The node graph of a glTF file, the transforms of its nodes, and skins, which move vertices by nodes; without animation.
+
+Source: Khronos, glTF 2.0 specification, sections 3.5 (nodes) and 3.7.3 (skins).
+"""
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
+from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document, GltfObject
-from wrt.io.gltf.schema import Children, Visibility, exactly, read_as
+from wrt.io.gltf.schema import read
 from wrt.scene.values import as_transform
 
 
@@ -26,7 +31,7 @@ def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
         seen.add(index)
         with np.errstate(over="ignore", invalid="ignore"):  # `Object` refuses infinite matrices
             world = parent @ local_matrix(node, f"nodes[{index}]")
-        if not (document.extension(node, "KHR_node_visibility", Visibility, f"nodes[{index}]") or Visibility()).visible:
+        if not document.extension_or_defaults(node, "KHR_node_visibility", f"nodes[{index}]").visible:
             continue
         yield index, node, world
         children = [(child, f"nodes[{index}].children[{i}]", world) for i, child in enumerate(node.children)]
@@ -45,7 +50,7 @@ def _roots(document: Document) -> list[tuple[int, str]]:
 
 def parents_of(document: Document) -> dict[int, int]:
     """Return the parent of each node that has one. Raises InputError if a node has two parents or is its own ancestor."""
-    nodes = [read_as(Children, raw, f"nodes[{index}]") for index, raw in enumerate(document.raw("nodes"))]
+    nodes = [read({"children": [int]}, raw, f"nodes[{index}]") for index, raw in enumerate(document.raw("nodes"))]
     parent: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for i, child in enumerate(node.children):
@@ -69,13 +74,10 @@ def local_matrix(node: GltfObject, place: str) -> np.ndarray:
     """Return a node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
     if node.matrix is not None:
         with at(f"{place}.matrix"):
-            return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")
-    translation = exactly(node.translation or [0.0] * 3, 3, f"{place}.translation")
-    scale = exactly(node.scale if node.scale is not None else [1.0] * 3, 3, f"{place}.scale")
-    rotation = exactly(node.rotation or [0.0, 0.0, 0.0, 1.0], 4, f"{place}.rotation")
-    if not any(rotation):
+            return as_transform(np.array(node.matrix).reshape(4, 4).T, "it")
+    if not any(node.rotation):
         raise InputError("must be a unit quaternion, got zero", place=f"{place}.rotation")
-    return compose(np.array([translation]), np.array([rotation]), np.array([scale]))[0]
+    return compose(np.array([node.translation]), np.array([node.rotation]), np.array([node.scale]))[0]
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -92,3 +94,67 @@ def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) ->
     matrices[:, :3, 3] = translation
     matrices[:, 3, 3] = 1.0
     return matrices
+
+
+class Skins:
+    """Cache of the joint matrices of skins."""
+
+    def __init__(self, document: Document, accessors: Accessors) -> None:
+        self._document, self._accessors = document, accessors
+        self._matrices: dict[int, np.ndarray] = {}
+
+    def blend(self, skin: int, primitive: GltfObject, count: int, place: str) -> np.ndarray:
+        """Return the matrices (count, 3, 4) that move each vertex of a primitive to world space; weights are scaled to a sum of 1."""
+        matrices, sets = self._joints(skin, place), sum(name.startswith("JOINTS_") for name in primitive.attributes)
+        joints, weights = (np.concatenate([self._accessors.read(
+            primitive.attributes.get(f"{name}_{i}", -1), "VEC4", f"{place}.attributes.{name}_{i}") for i in range(sets)], axis=1)
+            for name in ("JOINTS", "WEIGHTS"))
+        if joints.shape != weights.shape or len(joints) != count:
+            raise InputError(f"have {len(joints)} and {len(weights)} elements, but POSITION has {count}",
+                             place=f"{place}.attributes: JOINTS_0 and WEIGHTS_0")
+        joints = np.where(weights != 0.0, joints, 0).astype(np.int64)  # the joint of a weight of 0 may be anything
+        if joints.max() >= len(matrices):
+            raise InputError(f"is {joints.max()}, but there are {len(matrices)} joints", place=f"{place}.attributes.JOINTS_0")
+        total = weights.sum(axis=1, keepdims=True, dtype=np.float64)
+        weights = np.divide(weights, total, out=np.eye(1, weights.shape[1]).repeat(count, axis=0), where=total != 0.0)
+        out = np.zeros((count, 3, 4))
+        for i in range(weights.shape[1]):
+            out += weights[:, i, None, None] * matrices[joints[:, i], :3]
+        return out
+
+    def _joints(self, skin: int, place: str) -> np.ndarray:
+        """Return the matrices (J, 4, 4) of a skin's joints: mesh space to world space."""
+        if skin not in self._matrices:
+            source, where = self._document.item("skins", skin, place), f"skins[{skin}]"
+            worlds = np.array([self._world(joint, f"{where}.joints[{i}]") for i, joint in enumerate(source.joints)])
+            if not len(worlds):
+                raise InputError("must hold one joint or more", place=f"{where}.joints")
+            if source.inverseBindMatrices is not None:
+                inverse = self._accessors.read(source.inverseBindMatrices, "MAT4", f"{where}.inverseBindMatrices")
+                if len(inverse) < len(worlds):
+                    raise InputError(f"has {len(inverse)} matrices for {len(worlds)} joints", place=f"{where}.inverseBindMatrices")
+                worlds = worlds @ inverse[:len(worlds)].reshape(-1, 4, 4).transpose(0, 2, 1).astype(np.float64)
+            self._matrices[skin] = worlds
+        return self._matrices[skin]
+
+    @cached_property
+    def _parents(self) -> dict[int, int]:
+        return parents_of(self._document)
+
+    def _world(self, joint: int | None, place: str) -> np.ndarray:
+        """Return the matrix (4, 4) of a node to world space, whether the scene shows the node or not."""
+        world = np.eye(4)
+        while joint is not None:
+            world = local_matrix(self._document.item("nodes", joint, place), f"nodes[{joint}]") @ world
+            joint = self._parents.get(joint)
+        return world
+
+
+def moved(blend: np.ndarray, points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, bool]:
+    """Return points and normals (V, 3) moved by matrices (V, 3, 4), and True if these mirror: faces then need the other winding."""
+    a, b, c = np.moveaxis(blend[:, :, :3], 2, 0)
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+    determinants = np.einsum("vi,vi->v", a, cofactors[:, :, 0])
+    if normals is not None:  # by the inverse transpose, but for a positive factor
+        normals = np.einsum("vij,vj->vi", cofactors, normals) * np.sign(determinants)[:, None]
+    return np.einsum("vij,vj->vi", blend[:, :, :3], points) + blend[:, :, 3], normals, bool(np.median(determinants) < 0.0)

@@ -20,7 +20,7 @@ from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
-from wrt.io.gltf.schema import PunctualLight, PunctualLightOfNode, PunctualLights, SpotCone, Weights, exactly, read_as
+from wrt.io.gltf.schema import LIGHT, LIGHTS, read
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.defaults import Staging, add_fill, expose, is_lit, stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
@@ -57,7 +57,7 @@ def load_gltf(path: PathLike, staging: Staging | None = None, *, staged: bool = 
     return scene
 
 
-LIGHTS: dict[str, Callable[..., Light]] = {
+_LIGHTS: dict[str, Callable[..., Light]] = {
     "point": lambda place, direction, color, cone, name: PointLight(place, color, name),
     "directional": lambda place, direction, color, cone, name: DirectionalLight(direction, color, name),
     "spot": lambda place, direction, color, cone, name: SpotLight(place, direction, color, cone[0], cone[1], name),
@@ -92,7 +92,7 @@ class _Reader:
         for index, animation in enumerate([] if self.shapes_only else document.raw("animations")):
             name = animation.get("name") if isinstance(animation, dict) else None
             left_out.add("motion", "animation", name if isinstance(name, str) and name else f"animation {index}")
-        for extension, raw in (document.gltf.extensions or {}).items():
+        for extension, raw in document.gltf.extensions.items():
             if extension not in left_out:
                 left_out.add_extensions({extension: raw}, "file", document.path.name)
         scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
@@ -104,8 +104,7 @@ class _Reader:
         source = self.document.item("meshes", node.mesh, f"{place}.mesh")
         weights: list[float] = []
         if any(primitive.targets for primitive in source.primitives):
-            weights = read_as(Weights, self.document.raw("nodes")[index], place).weights or read_as(
-                Weights, self.document.raw("meshes")[node.mesh], f"meshes[{node.mesh}]").weights
+            weights = node.weights or read({"weights": [float]}, self.document.raw("meshes")[node.mesh], f"meshes[{node.mesh}]").weights
         key = (node.mesh, tuple(weights), node.skin)
         if key not in self._parts:
             self.document.left_out.add_extensions(source.extensions, "mesh", source.name or f"mesh {node.mesh}")
@@ -124,7 +123,7 @@ class _Reader:
         for i, primitive in enumerate(source.primitives):
             where = f"meshes[{index}].primitives[{i}]"
             # A compressed copy of plain accessors has no effect: a file without plain accessors would require the extension.
-            extensions = {k: v for k, v in (primitive.extensions or {}).items() if k != "KHR_draco_mesh_compression"}
+            extensions = {k: v for k, v in primitive.extensions.items() if k != "KHR_draco_mesh_compression"}
             left_out.add_extensions(extensions, "mesh", mesh_name)
             posed = skin is not None and {"JOINTS_0", "WEIGHTS_0"} <= set(primitive.attributes)
             if posed < (skin is not None):
@@ -161,27 +160,27 @@ class _Reader:
                                 OrthographicCamera(world, 2.0 * lens.ymag, name=name))
 
     def _add_light(self, node: GltfObject, world: np.ndarray, place: str) -> None:
-        link = self.document.extension(node, "KHR_lights_punctual", PunctualLightOfNode, place)
+        link = self.document.extension(node, "KHR_lights_punctual", place)
         if link is None:
             return
         here = f"{place}.extensions.KHR_lights_punctual.light"
-        lights = (self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "") or PunctualLights()).lights
+        raw = self.document.gltf.extensions.get("KHR_lights_punctual")
+        lights = [] if raw is None else read(LIGHTS, raw, "extensions.KHR_lights_punctual").lights
         if not 0 <= link.light < len(lights):
             raise InputError(f"is {link.light}, but there are {len(lights)} lights", place=here)
         left_out, clamp = self.document.left_out, self.document.mistakes.clamp
         where = f"extensions.KHR_lights_punctual.lights[{link.light}]"
-        source = read_as(PunctualLight, lights[link.light], where)
+        source = read(LIGHT, lights[link.light], where)
         name = node.name or source.name or f"light {link.light}"
-        if source.type not in LIGHTS:
-            raise InputError(f"must be one of {', '.join(LIGHTS)}, got {short(source.type)}", place=f"{where}.type")
+        if source.type not in _LIGHTS:
+            raise InputError(f"must be one of {', '.join(_LIGHTS)}, got {short(source.type)}", place=f"{where}.type")
         if source.range is not None:
             left_out.add("range", "light", name)
         if not (world[:3, :3] if source.type == "point" else world[:3, 2]).any():
             left_out.add("lights scaled to no volume", "light", name)
             return
-        color = clamp([c * source.intensity for c in exactly(source.color, 3, f"{where}.color")], 0.0, LARGEST, "color", "light", name)
-        cone = source.spot or SpotCone()
-        outer = clamp(rounded(cone.outerConeAngle, 1e-4, math.pi / 2), 1e-4, math.pi / 2, "outerConeAngle", "light", name)
-        inner = clamp(rounded(cone.innerConeAngle, 0.0, outer), 0.0, outer, "innerConeAngle", "light", name)
+        color = clamp([c * source.intensity for c in source.color], 0.0, LARGEST, "color", "light", name)
+        outer = clamp(rounded(source.spot.outerConeAngle, 1e-4, math.pi / 2), 1e-4, math.pi / 2, "outerConeAngle", "light", name)
+        inner = clamp(rounded(source.spot.innerConeAngle, 0.0, outer), 0.0, outer, "innerConeAngle", "light", name)
         with at(where):
-            self.lights.append(LIGHTS[source.type](tuple(world[:3, 3]), tuple(-world[:3, 2]), tuple(color), (inner, outer), name))
+            self.lights.append(_LIGHTS[source.type](tuple(world[:3, 3]), tuple(-world[:3, 2]), tuple(color), (inner, outer), name))

@@ -1,271 +1,152 @@
-"""Schema of glTF documents: JSON values become dataclass instances, each value checked against its declared type.
+"""Objects of glTF files that wrt reads: one table declares their keys, and each JSON value is checked against it.
 
-pygltflib has the dataclasses of core glTF; this file has the dataclasses of the extensions that wrt reads. The decoder of pygltflib is
-not used: it turns 1.5 and "1" into the index 1, and its errors name no place in the file.
+A key's entry is its type (int, float, str, bool), or its default, whose type it has. [entry] is an array; {str: entry} is an object with
+any keys; a tuple is an array of as many numbers, of its values by default or of (float, ...) without a default; a dictionary is an object.
+A missing object has the defaults of its keys; it is None if one of them is needed. Keys that wrt does not read are not in the table.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import math
-import types
-import typing
-from dataclasses import dataclass, field
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 from wrt.core.checks import short
 from wrt.core.errors import InputError
 
-# --- the extensions that wrt reads ------------------------------------------------------------------------------------
+
+class Needed(NamedTuple):
+    """An entry whose key must be there."""
+
+    entry: Any
 
 
-@dataclass
-class TextureInfo:
-    index: int
-    texCoord: int = 0
-    extensions: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
-class TextureTransform:
-    offset: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    rotation: float = 0.0
-    scale: list[float] = field(default_factory=lambda: [1.0, 1.0])
-    texCoord: int | None = None
-
-
-@dataclass
-class TextureSource:
-    source: int
-
-
-@dataclass
-class Transmission:
-    transmissionFactor: float = 0.0
-    transmissionTexture: TextureInfo | None = None
-
-
-@dataclass
-class Volume:
-    thicknessFactor: float = 0.0
-    attenuationDistance: float = math.inf
-    attenuationColor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-
-
-@dataclass
-class Ior:
-    ior: float = 1.5
-
-
-@dataclass
-class Specular:
-    specularFactor: float = 1.0
-    specularTexture: TextureInfo | None = None
-    specularColorFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    specularColorTexture: TextureInfo | None = None
-
-
-@dataclass
-class SpecularGlossiness:
-    diffuseFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0, 1.0])
-    diffuseTexture: TextureInfo | None = None
-    specularFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    glossinessFactor: float = 1.0
-    specularGlossinessTexture: TextureInfo | None = None
-
-
-@dataclass
-class Clearcoat:
-    clearcoatFactor: float = 0.0
-    clearcoatTexture: TextureInfo | None = None
-    clearcoatRoughnessFactor: float = 0.0
-    clearcoatRoughnessTexture: TextureInfo | None = None
-    clearcoatNormalTexture: TextureInfo | None = None
-
-
-@dataclass
-class EmissiveStrength:
-    emissiveStrength: float = 1.0
-
-
-@dataclass
-class Unlit:
-    pass
-
-
-@dataclass
-class SpotCone:
-    innerConeAngle: float = 0.0
-    outerConeAngle: float = math.pi / 4
-
-
-@dataclass
-class PunctualLight:
-    type: str
-    name: str | None = None
-    color: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    intensity: float = 1.0
-    range: float | None = None
-    spot: SpotCone | None = None
-
-
-@dataclass
-class PunctualLights:
-    lights: list[dict[str, Any]] = field(default_factory=list)  # a light that no node shows cannot refuse the file
-
-
-@dataclass
-class PunctualLightOfNode:
-    light: int
-
-
-@dataclass
-class DracoMesh:
-    bufferView: int
-    attributes: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass
-class MeshoptView:
-    buffer: int
-    byteLength: int
-    byteStride: int
-    count: int
-    mode: str
-    byteOffset: int = 0
-    filter: str = "NONE"
-
-
-@dataclass
-class Instancing:
-    attributes: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass
-class Visibility:
-    visible: bool = True
-
-
-# --- parts of a node that are read by themselves ----------------------------------------------------------------------
-
-
-@dataclass
-class Children:
-    children: list[int] = field(default_factory=list)
-
-
-@dataclass
-class Weights:
-    weights: list[float] = field(default_factory=list)
-
-
-# --- checking ---------------------------------------------------------------------------------------------------------
-
-# Fields that the specification requires, although pygltflib gives them the default None.
-_REQUIRED = {
-    "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
-    "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
-    "BufferView": ("buffer", "byteLength"), "Buffer": ("byteLength",), "Camera": ("type",), "Perspective": ("yfov",),
-    "Orthographic": ("xmag", "ymag"),
-    "Primitive": ("attributes",), "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",),
-    "GLTF2": ("asset",),
+WHITE, ANY = (1.0, 1.0, 1.0), {str: Any}
+NAMED = {"name": str, "extensions": ANY}
+TEXTURE = {"index": Needed(int), "texCoord": 0, "extensions": ANY}
+OF_SPARSE = {"bufferView": Needed(int), "byteOffset": 0}
+PRIMITIVE = {"attributes": Needed({str: int}), "indices": int, "material": int, "mode": 4, "targets": [{str: int}], "extensions": ANY}
+FILE = {"scene": int, "extensions": ANY, "extensionsRequired": [str]}
+# Items of the arrays of a file.
+ITEMS: dict[str, dict[str, Any]] = {
+    "accessors": {
+        "bufferView": int, "byteOffset": 0, "componentType": Needed(int), "normalized": False, "count": Needed(int), "type": Needed(str),
+        "sparse": {"count": Needed(int), "indices": Needed(OF_SPARSE | {"componentType": Needed(int)}), "values": Needed(OF_SPARSE)}},
+    "bufferViews": {"buffer": Needed(int), "byteOffset": 0, "byteLength": Needed(int), "byteStride": int, "extensions": ANY},
+    "buffers": {"uri": str, "byteLength": Needed(int)},
+    "cameras": NAMED | {
+        "type": Needed(str), "perspective": {"yfov": Needed(float)}, "orthographic": {"xmag": Needed(float), "ymag": Needed(float)}},
+    "images": {"name": str, "uri": str, "bufferView": int},
+    "materials": NAMED | {
+        "pbrMetallicRoughness": {"baseColorFactor": (*WHITE, 1.0), "baseColorTexture": TEXTURE, "metallicFactor": 1.0,
+                                 "roughnessFactor": 1.0, "metallicRoughnessTexture": TEXTURE},
+        "normalTexture": TEXTURE | {"scale": 1.0}, "emissiveTexture": TEXTURE, "emissiveFactor": (0.0, 0.0, 0.0),
+        "alphaMode": "OPAQUE", "alphaCutoff": 0.5, "doubleSided": False},
+    "meshes": NAMED | {"primitives": [PRIMITIVE]},
+    "nodes": NAMED | {
+        "camera": int, "children": [int], "skin": int, "mesh": int, "weights": [float], "matrix": (float,) * 16,
+        "rotation": (0.0, 0.0, 0.0, 1.0), "scale": WHITE, "translation": (0.0, 0.0, 0.0)},
+    "samplers": {"wrapS": 10497, "wrapT": 10497, "magFilter": int},
+    "scenes": NAMED | {"nodes": [int]},
+    "skins": {"joints": [int], "inverseBindMatrices": int},
+    "textures": NAMED | {"sampler": int, "source": int},
 }
-# Fields that wrt never reads, so that no mistake in them refuses a file. `Document.item` reads the arrays of GLTF2, item by item.
-_UNREAD = {
-    "Accessor": ("min", "max"), "BufferView": ("target",), "Image": ("mimeType",), "Material": ("occlusionTexture",),
-    "Mesh": ("weights",), "Orthographic": ("xmag", "zfar", "znear"), "Perspective": ("aspectRatio", "zfar", "znear"),
-    "Sampler": ("input", "interpolation", "minFilter", "output"), "Skin": ("skeleton",),
-    "GLTF2": ("accessors", "animations", "asset", "bufferViews", "buffers", "cameras", "extensionsUsed", "images", "materials", "meshes",
-              "nodes", "samplers", "scenes", "skins", "textures"),
+MESHOPT = {"buffer": Needed(int), "byteLength": Needed(int), "byteStride": Needed(int), "count": Needed(int), "mode": Needed(str),
+           "byteOffset": 0, "filter": "NONE"}
+EXTENSIONS: dict[str, dict[str, Any]] = {
+    "KHR_texture_transform": {"offset": (0.0, 0.0), "rotation": 0.0, "scale": (1.0, 1.0), "texCoord": int},
+    "EXT_texture_webp": {"source": Needed(int)},
+    "EXT_texture_avif": {"source": Needed(int)},
+    "KHR_materials_transmission": {"transmissionFactor": 0.0, "transmissionTexture": TEXTURE},
+    "KHR_materials_volume": {"thicknessFactor": 0.0, "attenuationDistance": math.inf, "attenuationColor": WHITE},
+    "KHR_materials_ior": {"ior": 1.5},
+    "KHR_materials_specular": {"specularFactor": 1.0, "specularTexture": TEXTURE, "specularColorFactor": WHITE,
+                               "specularColorTexture": TEXTURE},
+    "KHR_materials_pbrSpecularGlossiness": {
+        "diffuseFactor": (*WHITE, 1.0), "diffuseTexture": TEXTURE, "specularFactor": WHITE, "glossinessFactor": 1.0,
+        "specularGlossinessTexture": TEXTURE},
+    "KHR_materials_clearcoat": {
+        "clearcoatFactor": 0.0, "clearcoatTexture": TEXTURE, "clearcoatRoughnessFactor": 0.0, "clearcoatRoughnessTexture": TEXTURE,
+        "clearcoatNormalTexture": TEXTURE},
+    "KHR_materials_emissive_strength": {"emissiveStrength": 1.0},
+    "KHR_materials_unlit": {},
+    "KHR_lights_punctual": {"light": Needed(int)},  # of a node
+    "KHR_draco_mesh_compression": {"bufferView": Needed(int), "attributes": {str: int}},
+    "KHR_meshopt_compression": MESHOPT,
+    "EXT_meshopt_compression": MESHOPT,
+    "EXT_mesh_gpu_instancing": {"attributes": {str: int}},
+    "KHR_node_visibility": {"visible": True},
 }
-_SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
-    int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)),
-    bool: ("true or false", (bool,)),
+LIGHTS = {"lights": [ANY]}  # KHR_lights_punctual of a file; a light that no node shows cannot refuse the file
+LIGHT = {"type": Needed(str), "name": str, "color": WHITE, "intensity": 1.0, "range": float,
+         "spot": {"innerConeAngle": 0.0, "outerConeAngle": math.pi / 4}}
+_SCALARS: dict[Any, tuple[str, Any]] = {
+    int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)), bool: ("true or false", (bool,)),
 }
 
 
-def read_as(hint: Any, raw: object, place: str) -> Any:
-    """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass of this file or of pygltflib.
+def read(entry: Any, raw: Any, place: str) -> Any:
+    """Convert a JSON value by its entry in the table; an object becomes a namespace.
 
-    Unknown keys and `extras` are left out; null counts as a missing key. Raises InputError with the place of a value of another type, of
-    a number that is not finite, or of a required key that is missing."""
-    hint = _without_none(hint)
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _SCALARS:
-        return _scalar(hint, raw, place)
-    if origin is list:
+    null counts as a missing key. Raises InputError with the place of a value of another type, of a number that is not finite, or of a
+    needed key that is missing."""
+    if isinstance(entry, Needed):
+        return read(entry.entry, raw, place)
+    if isinstance(entry, dict):
+        if not isinstance(raw, dict):
+            raise _wrong("an object", raw, place)
+        if str in entry:
+            return raw if entry is ANY else {key: read(entry[str], each, f"{place}.{key}") for key, each in raw.items()}
+        return _object(entry, raw, place)
+    if isinstance(entry, list | tuple):
         if not isinstance(raw, list):
             raise _wrong("an array", raw, place)
-        return [read_as(arguments[0], item, f"{place}[{i}]") for i, item in enumerate(raw)]
-    if not isinstance(raw, dict):
-        raise _wrong("an object", raw, place)
-    if origin is dict:
-        return raw if arguments[1] is Any else {k: read_as(arguments[1], v, f"{place}.{k}") for k, v in raw.items()}
-    if hint.__name__ == "Attributes":  # accessors by name, in the only class of pygltflib that is no dataclass
-        return {k: read_as(int, v, f"{place}.{k}") for k, v in raw.items()}
-    return _object(hint, raw, place)
+        values = [read(float if isinstance(entry, tuple) else entry[0], each, f"{place}[{i}]") for i, each in enumerate(raw)]
+        if isinstance(entry, tuple) and len(values) != len(entry):
+            raise InputError(f"must hold {len(entry)} numbers, got {len(values)}", place=place)
+        return values
+    return _scalar(entry if isinstance(entry, type) else type(entry), raw, place)
 
 
-def exactly(values: list[float], count: int, place: str) -> list[float]:
-    """Return `values` unchanged. Raises InputError at `place` unless there are `count` values."""
-    if len(values) != count:
-        raise InputError(f"must hold {count} numbers, got {len(values)}", place=place)
-    return values
+def _object(entry: dict[str, Any], raw: dict[str, Any], place: str) -> SimpleNamespace:
+    there = {key: raw[key] for key in entry if raw.get(key) is not None}
+    for key, each in entry.items():
+        if isinstance(each, Needed) and key not in there:
+            raise InputError("is required", place=_join(place, key))
+    return SimpleNamespace(**{key: read(each, there[key], _join(place, key)) if key in there else _default(each)
+                              for key, each in entry.items()})
 
 
-def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
-    for name in _required(cls):
-        if raw.get(name) is None:
-            raise InputError("is required", place=_join(place, name))
-    return cls(**{name: read_as(hint, raw[name], _join(place, name)) for name, hint in _fields(cls).items() if raw.get(name) is not None})
+def _default(entry: Any) -> Any:
+    if isinstance(entry, type):
+        return None
+    if isinstance(entry, tuple):
+        return None if float in entry else list(entry)
+    if isinstance(entry, list):
+        return []
+    if not isinstance(entry, dict):
+        return entry
+    if str in entry:
+        return {}
+    return None if any(isinstance(each, Needed) for each in entry.values()) else _object(entry, {}, "")
 
 
-@functools.cache
-def _fields(cls: Any) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
-    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.name not in ("extras", *_UNREAD.get(cls.__name__, ()))}
-
-
-@functools.cache
-def item_type(array: str) -> Any:
-    """Return the class of pygltflib for the items of an array of a glTF file."""
-    import pygltflib
-
-    return typing.get_args(typing.get_type_hints(pygltflib.GLTF2)[array])[0]
-
-
-@functools.cache
-def _required(cls: Any) -> tuple[str, ...]:
-    without_default = tuple(f.name for f in dataclasses.fields(cls)
-                            if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING)
-    return without_default + _REQUIRED.get(cls.__name__, ())
-
-
-def _scalar(hint: Any, raw: Any, place: str) -> Any:
-    expected, accepted = _SCALARS[hint]
-    if hint is int and isinstance(raw, float) and raw.is_integer():
+def _scalar(kind: Any, raw: Any, place: str) -> Any:
+    expected, accepted = _SCALARS[kind]
+    if kind is int and isinstance(raw, float) and raw.is_integer():
         raw = int(raw)  # JSON has one kind of number
-    fits = isinstance(raw, accepted) and (hint is bool or not isinstance(raw, bool))
-    if not fits:
+    if not isinstance(raw, accepted) or (isinstance(raw, bool) and kind is not bool):
         raise _wrong(expected, raw, place)
-    if hint is int and not -(1 << 63) <= raw < 1 << 63:
+    if kind is int and not -(1 << 63) <= raw < 1 << 63:
         raise _wrong("an integer of at most 64 bits", raw, place)
-    if hint is float:
+    if kind is float:
         try:
-            number = float(raw)
+            raw = float(raw)
         except OverflowError:  # an integer beyond float64
-            number = math.inf
-        if not math.isfinite(number):
+            raw = math.inf
+        if not math.isfinite(raw):
             raise _wrong("a finite number", raw, place)
-        return number
     return raw
-
-
-def _without_none(hint: Any) -> Any:
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return next(argument for argument in typing.get_args(hint) if argument is not type(None))
-    return hint
 
 
 def _join(place: str, name: str) -> str:

@@ -10,7 +10,7 @@ from tests.data import data_path
 from tests.gltf_files import GltfFile
 from tests.refused import refused
 from wrt.core.errors import InputError
-from wrt.io.gltf.meshopt import NAMES
+from wrt.io.gltf.document import MESHOPT as NAMES
 from wrt.io.gltf.reader import load_gltf
 from wrt.scene.shapes import icosphere
 
