@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from wrt.kernels.headers import STACK_LENGTH, text_of, with_headers
+from wrt.kernels.parameters import Material as Material
 
 NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id of a miss during traversal: larger than every index, so that a hit at equal t wins
 EPSILON = wp.constant(2.0**-24)  # unit roundoff u of float32
@@ -180,43 +181,6 @@ class Texture:
     row_v: wp.vec3
     color_a: wp.vec3  # Colour of the checkerboard's square at (0, 0); color_b: of its neighbours.
     color_b: wp.vec3
-
-
-@wp.struct
-class Material:
-    """A material: wrt.scene.materials.Material describes the fields. A texture is an index into Surfaces.textures, or -1 for none."""
-
-    kind: int
-    albedo: wp.vec3
-    specular: wp.vec3
-    exponent: float
-    eta: wp.vec3
-    k: wp.vec3
-    ior: float
-    absorption: wp.vec3
-    thin: int
-    metallic: float
-    roughness: float
-    transmission: float
-    specular_factor: float
-    specular_color: wp.vec3
-    clearcoat: float
-    clearcoat_roughness: float
-    emission: wp.vec3
-    two_sided: int
-    alpha: float
-    alpha_mode: int
-    alpha_cutoff: float
-    normal_scale: float
-    albedo_texture: int
-    metallic_roughness_texture: int
-    transmission_texture: int
-    specular_texture: int
-    specular_color_texture: int
-    clearcoat_texture: int
-    clearcoat_roughness_texture: int
-    emission_texture: int
-    normal_texture: int
 
 
 @wp.struct

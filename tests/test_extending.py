@@ -55,6 +55,8 @@ again = wrt.load_accel("ball.accel", ball).closest_hit(*rays)
 assert np.array_equal(again.prim_id, brute.prim_id)
 
 # A retroreflector returns rays to the camera: a pixel that looks up shows half the radiance from behind and below the camera.
+import retroreflector
+
 sign = wrt.render("sign.toml", threads=2).pixels[:, 16, 0]
 slope = np.tan(np.radians(20.0)) * (1.0 - (2.0 * np.arange(32) + 1.0) / 32.0)
 assert np.allclose(sign, 0.5 * 0.5 * (1.0 - slope / np.sqrt(1.0 + slope**2)), atol=1e-3)
@@ -132,17 +134,16 @@ material = "sign"
 """
 
 
-# The right half of a retroreflector is half worn. Both loops of the renderer shade it alike, with other textures and without.
+# The right half of a mirror is half worn. Both loops of the renderer shade it alike, with other textures and without.
 WORN_SIGNS = """
 import itertools
 from dataclasses import replace
 import numpy as np, wrt
 from wrt.core.device import load_kernel, start
-from wrt.renderer.film import DeviceFilm
+from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of, render_kernel
 from wrt.renderer.prepare import prepare
-from wrt.renderer.film import Work
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Checkerboard, Material, Texture
@@ -151,9 +152,9 @@ from wrt.scene.shapes import quad
 
 PART = (0, 0, 32, 32)
 worn = Texture(np.uint8([[[0, 255, 255, 255], [255, 0, 0, 0]]]), srgb=False, wrap=("clamp", "clamp"))
-sign = Material("retroreflector", albedo=(0.5, 0.5, 0.5), wear=0.5, wear_texture=worn)
+sign = Material("mirror", albedo=(0.5, 0.5, 0.5), wear=0.5, wear_texture=worn)
 sheet = replace(quad((-2, -2, 0), (4, 0, 0), (0, 4, 0)), uvs=np.float32([[0, 0], [1, 0], [1, 1], [0, 1]]))
-board = Object(quad((5, -1, 9), (2, 0, 0), (0, 2, 0)), (Material(albedo_texture=Checkerboard()),))
+board = Object(quad((12, -1, 9), (2, 0, 0), (0, 2, 0)), (Material(albedo_texture=Checkerboard()),))
 behind = np.diag([1.0, 1.0, 1.0, 1.0])
 behind[2, 3] = -5.0
 
@@ -251,12 +252,13 @@ def test_the_text_can_be_followed(tmp_path: Path) -> None:
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(EXTENSIONS / "structure", tmp_path, dirs_exist_ok=True)
     apply(tmp_path)
-    for file in (ROOT / "tests" / "stored_normal.py", EXTENSIONS / "beam.py", EXTENSIONS / "horizon.py"):
+    for file in (ROOT / "tests" / "stored_normal.py", *(EXTENSIONS / f"{name}.py" for name in ("beam", "horizon", "retroreflector"))):
         shutil.copy(file, tmp_path)
     (tmp_path / "sign.toml").write_text(SIGN)
     (tmp_path / "stage.toml").write_text(STAGE)
     assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")
     assert python(tmp_path, "-c", WORN_SIGNS).endswith("all of it works\n")
+    (tmp_path / "sign.toml").write_text(SIGN.replace("retroreflector", "mirror"))
     python(tmp_path, "-m", "wrt", "render", "sign.toml", "-q", "--accel", "runs", "-o", "sign.png")
     assert (tmp_path / "sign.png").exists()
 

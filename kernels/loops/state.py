@@ -1,19 +1,43 @@
 """The state of a wave: arrays with one entry for each pixel, sample, place in a queue, or hit. A place is an index in a queue.
+Vectorised loops process BLOCK hits at a time. Each struct that they load and store has rows of its own (kernels/rows.py), from HITS on.
 
 The host writes Task and Pixels.order; kernels write the other arrays. wrt/renderer/launches.py allocates the arrays for up to `capacity`
 samples. Sample s belongs to pixel s / task.samples of the wave, rounded down."""
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 import warp as wp
 
+from wrt.kernels import structs
+from wrt.kernels.headers import constants, with_headers
+from wrt.kernels.parameters import Texels
 from wrt.kernels.query import HitArrays, RenderRays, store_render_ray
+from wrt.kernels.rows import Rows
+from wrt.kernels.shade import sampling, textures
+from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import PendingLight, Sample
+from wrt.kernels.shade.surface import Surface, Triangle
+from wrt.kernels.structs import Emitter
 
 Path = make_path(False)
 ray_of = make_paths(False).ray_of
+# Constants of Python for the C++ headers of kernels/shade. A header implements functions of the Python file of the same name: a C++
+# function and its Python function have one name and return the same bits (tests/kernels/shade/test_twins.py).
+LAYOUT_H = constants({name: getattr(sampling, name) for name in (
+    "LANES", "HASH_1", "HASH_2", "LK_1", "LK_2", "LK_3", "SEED_X", "SEED_Y", "BITS_1", "BITS_2", "BITS_4", "BITS_8", "UNIT")} | {
+        name: getattr(textures, name) for name in ("FARTHEST", "WRAP_REPEAT", "WRAP_CLAMP", "WRAP_MIRROR")})
+HEADERS = ("shade/sampling.h", "shade/textures.h", "shade/backgrounds.h", "shade/film.h")
 BLOCK = 64  # Number of hits or missed rays that vectorised loops process together.
+
+# lanes_kernel: decorator of CPU kernels that call the functions of these headers.
+if TYPE_CHECKING:
+    from typing import no_type_check as lanes_kernel
+else:
+    lanes_kernel = partial(structs.kernel, extra_build_options=with_headers(*HEADERS, layout=LAYOUT_H))
 
 
 @wp.struct
@@ -113,13 +137,6 @@ class ShadowQueue:
 
 
 @wp.struct
-class Block:
-    """Intermediate values of up to BLOCK hits or missed rays, in the layout of wave_rows.py."""
-
-    rows: wp.array(dtype=wp.float32)  # Row r begins at index r * BLOCK.
-
-
-@wp.struct
 class Wave:
     """The whole state of a wave. The arrays `task` and `progress` have one entry."""
 
@@ -133,7 +150,7 @@ class Wave:
     receivers: Receivers
     shadows: Shadows
     shadow_queue: ShadowQueue
-    block: Block
+    rows: wp.array(dtype=wp.float32)  # Values of up to BLOCK hits or missed rays. Row r begins at index r * BLOCK.
 
 
 @wp.func_native("""
@@ -167,3 +184,70 @@ def queue_next(wave: Wave, k: int, s: int, pending: int):
     wave.samples.pending[s] = pending - 1
     wave.queue.sample[k] = s
     store_render_ray(wave.queue.rays, k, ray_of(wave.samples.paths[(pending - 1) * wave.capacity + s]))
+
+
+# --- the rows of a block ----------------------------------------------------------------------------------------------
+
+
+@wp.struct
+class TriangleHit:
+    """A hit, with the data of its triangle for its Surface and shading normal. If it is on a sphere, the triangle is any triangle."""
+
+    triangle: Triangle
+    u: float  # Barycentric of corner v1.
+    v: float  # Barycentric of corner v2.
+    direction: wp.vec3  # The ray's direction.
+    material: int  # Material of the triangle or sphere.
+    is_mapped: int  # 1 if the material has a normal map.
+    normal_scale: float  # Material.normal_scale.
+
+
+@wp.struct
+class SphereHit:
+    """A sphere and a hit point, with the data for its Surface."""
+
+    sphere: wp.vec4  # Centre and radius, in world space.
+    point: wp.vec3  # The ray's point at the hit.
+    is_hit: int  # 1 if the ray hit this sphere; 0 if it hit a triangle.
+
+
+@wp.struct
+class Key:
+    """The seed of a hit's random numbers: its path's key, and its sample's index."""
+
+    key: wp.uint32
+    index: wp.uint32
+
+
+@wp.struct
+class EmitterPoint:
+    """A sampled point on an emitter."""
+
+    emitter: Emitter
+    emission: wp.vec3  # Emission of the emitter's material.
+    two_sided: int  # 1 if the emitter's material emits on both sides.
+    xi: wp.vec2  # Places the point on the emitter, in [0, 1)^2.
+
+
+@wp.struct
+class Drawn:
+    """Tells where the background's sample for a hit is, if only some hits of a block have one."""
+
+    i: int  # Its index in the rows SKY; -1: there is none.
+
+
+HITS = Rows(TriangleHit, BLOCK)
+SPHERES = Rows(SphereHit, BLOCK, HITS.end)
+SURFACES = Rows(Surface, BLOCK, SPHERES.end)
+TEXELS = Rows(Texels, BLOCK, SURFACES.end)
+NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # Shading normals on the viewer's side.
+KEYS = Rows(Key, BLOCK, NORMALS.end)
+FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # Results of choose_facet.
+EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
+LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # Samples of light 0, if it is a mesh.
+SKY = Rows(LightSample, BLOCK, LIGHTS.end)  # Samples of the background.
+SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # Results of sky_point.
+DRAWN = Rows(Drawn, BLOCK, SKY_POINTS.end)
+MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, DRAWN.end)  # Directions of missed rays.
+MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # The background's radiance in these directions.
+ROWS = MISS_COLORS.end

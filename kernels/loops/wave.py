@@ -6,16 +6,15 @@ where the code has no branches. Each sample takes its paths and adds its light i
 the same bits (tests/wrt/renderer/test_waves.py).
 
 Python launches only the kernel trace_wave, which launches the others:
-1. For FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit, and shade_wave
-   (wave_shade.py), which pushes new paths and requests shadow rays.
+1. For FRESH camera rays at a time, while they are in the cache: begin_wave, closest_hit, and shade_wave (wave_shade.py), which
+   pushes new paths and requests shadow rays.
 2. Until no path waits: trace the shadow rays to each light, and add the direct light (add_direct_light). Then run closest_hit and
    shade_wave for the top path of each sample.
 3. Add the finished samples to the film (add_to_film).
 
 Each kernel is one thread that loops over its queue, so that it counts without atomics. The exceptions are the traversal kernels of
 structures without `stream` (wrt.accel.base), which have one thread for each ray. Traversal and shading are separate kernels, so that
-a new scene does not recompile traversal. The vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py,
-wave_numbers.py and wave_lights.py. They store their results in the rows of wave_rows.py."""
+a new scene does not recompile traversal. The vectorised parts of shading are in wave_hits.py and wave_lights.py."""
 
 from functools import cache
 from typing import Any
@@ -23,16 +22,16 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.launches import Launch, run_range, run_with
-from wrt.kernels.loops.state import Task, Wave, store_sample
+from wrt.kernels.loops.state import BLOCK, Task, Wave, lanes_kernel, store_sample
 from wrt.kernels.query import load_hit, load_render_ray, store_render_ray
+from wrt.kernels.rows import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, store_pixel
-from wrt.kernels.shade.headers import lanes_kernel
-from wrt.kernels.shade.sampling import LANES
+from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
+from wrt.kernels.shade.sampling import LANES, hash_pair, make_draw, quantiles
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import make_advance_shadow
 from wrt.kernels.shade.step import DirectLight, Sample, add_light, add_surface_light
-from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel, noinline
+from wrt.kernels.structs import AovFilm, Film, Limits, Surfaces, kernel, noinline
 
 FRESH = 2048  # Number of camera rays that are made, traced and shaded together, so that they stay in the cache.
 
@@ -41,6 +40,130 @@ FRESH = 2048  # Number of camera rays that are made, traced and shaded together,
 def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
     """Return the index in the film of the tile's pixel `at`. (x, y): the film's first pixel in the picture. columns: the film's width."""
     return (task.y + at / task.width - y) * columns + task.x + at % task.width - x
+
+
+# --- the camera rays of a wave ----------------------------------------------------------------------------------------
+
+
+def make_place_samples(features: Features) -> Any:
+    """Return place_samples(wave, film, limits, first, end): draw keys, film points and lens points of the pixels first .. end - 1."""
+    draw = make_draw(features)
+
+    @wp.func
+    def draw_samples(wave: Wave, limits: Limits, first: int, end: int):
+        task = wave.task[0]
+        for p in range(first, end):
+            x = wp.uint32(task.x + wave.pixels.order[p] % task.width)
+            y = wp.uint32(task.y + wave.pixels.order[p] / task.width)
+            key = hash_pair(hash_pair(limits.seed, x), y)
+            wave.pixels.key[p] = key
+            draw(key, 0, task.first_sample, task.samples, wave.samples.film_point, p * task.samples)
+            if wp.static(features.lens):
+                draw(key, 1, task.first_sample, task.samples, wave.samples.lens_point, p * task.samples)
+
+    @wp.func
+    def place_samples(wave: Wave, film: Film, limits: Limits, first: int, end: int):
+        task = wave.task[0]
+        draw_samples(wave, limits, first, end)
+        points = wave.samples.film_point
+        if wp.static(features.filter):
+            quantiles(film.filter_icdf, points, first * task.samples, (end - first) * task.samples)
+        for p in range(first, end):
+            center_x = float(task.x + wave.pixels.order[p] % task.width) + 0.5
+            center_y = float(task.y + wave.pixels.order[p] / task.width) + 0.5
+            i = p * task.samples
+            while i < (p + 1) * task.samples:
+                offset_x = number_of_vec2(points, i, 0)
+                offset_y = number_of_vec2(points, i, 1)
+                if wp.static(not features.filter):
+                    offset_x = offset_x - 0.5
+                    offset_y = offset_y - 0.5
+                put_in_vec2(points, i, 0, center_x + offset_x)
+                put_in_vec2(points, i, 1, center_y + offset_y)
+                i = i + 1
+
+    return place_samples
+
+
+def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
+    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the rays of the samples first .. end - 1, vectorised.
+
+    The ray of sample s is at place s. The result is the number of dead rays: no_ray() of film points that get no light."""
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray(features)
+
+    @wp.func
+    def queue_camera_rays(wave: Wave, camera: camera_struct, film: Film, first: int, end: int) -> int:
+        samples = wave.samples
+        rays = wave.queue.rays
+        dead = int(0)
+        i = int(first)
+        while i < end:
+            x = number_of_vec2(samples.film_point, i, 0)
+            y = number_of_vec2(samples.film_point, i, 1)
+            lens_xi = wp.vec2(0.0, 0.0)
+            if wp.static(features.lens):
+                lens_xi = wp.vec2(number_of_vec2(samples.lens_point, i, 0), number_of_vec2(samples.lens_point, i, 1))
+            ray = camera_ray(camera, wp.vec2(x / float(film.width), y / float(film.height)), lens_xi)
+            put_in_vec3(rays.origin, i, 0, ray.origin[0])
+            put_in_vec3(rays.origin, i, 1, ray.origin[1])
+            put_in_vec3(rays.origin, i, 2, ray.origin[2])
+            put_in_vec3(rays.direction, i, 0, ray.direction[0])
+            put_in_vec3(rays.direction, i, 1, ray.direction[1])
+            put_in_vec3(rays.direction, i, 2, ray.direction[2])
+            put_number(rays.t_max, i, ray.t_max)
+            put_int(rays.exclude, i, 0)
+            put_int(wave.queue.sample, i, i)
+            dead = dead + wp.where(ray.t_max > 0.0, 0, 1)
+            i = i + 1
+        return dead
+
+    return queue_camera_rays
+
+
+@wp.func
+def close_gaps(wave: Wave, first: int, end: int, queued: int) -> int:
+    """Remove the dead rays, no_ray(), of the samples first .. end - 1 from the queue. Samples with dead rays are black.
+
+    The live rays move to the places from `queued` on. Return the place behind the last live ray."""
+    place = queued
+    for s in range(first, end):
+        ray = load_render_ray(wave.queue.rays, s)
+        if ray.t_max > 0.0:
+            if place != s:
+                store_render_ray(wave.queue.rays, place, ray)
+                wave.queue.sample[place] = s
+            place += 1
+        else:
+            store_sample(wave.samples.total, s, Sample())
+    return place
+
+
+def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
+    """Return the kernel begin_wave, which queues the camera rays of a wave."""
+    camera_struct = camera_kind.Camera
+    place_samples, queue_camera_rays = make_place_samples(features), make_queue_camera_rays(features, camera_kind)
+
+    @lanes_kernel
+    def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
+        """Queue the camera rays of the pixels first_pixel .. end_pixel - 1, from place first_pixel * task.samples on."""
+        samples = wave.task[0].samples
+        queued = first_pixel * samples
+        first = int(first_pixel)
+        while first < end_pixel:
+            end = wp.min(first + wp.max(BLOCK / samples, 1), end_pixel)
+            place_samples(wave, film, limits, first, end)
+            if queue_camera_rays(wave, camera, film, first * samples, end * samples) > 0 or queued < first * samples:
+                queued = close_gaps(wave, first * samples, end * samples, queued)
+            else:
+                queued = end * samples
+            first = end
+        wave.progress[0].begun = queued
+
+    return begin_wave
+
+
+# --- shadow rays, and the film ----------------------------------------------------------------------------------------
 
 
 def make_shadow_kernel(features: Features) -> Any:
@@ -175,8 +298,28 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
     return trace_wave
 
 
+# --- AOVs -------------------------------------------------------------------------------------------------------------
+
+
+def make_begin_aov_kernel(camera_kind: Any) -> Any:
+    """Return the kernel that queues the rays through the pixels' centres. A centre that gets no light has no_ray()."""
+    camera_struct = camera_kind.Camera
+    camera_ray = camera_kind.make_camera_ray()
+
+    @kernel
+    def begin_aov(wave: Wave, camera: camera_struct, film: AovFilm):
+        task = wave.task[0]
+        for p in range(task.pixels):
+            x = task.x + wave.pixels.order[p] % task.width
+            y = task.y + wave.pixels.order[p] / task.width
+            ray = camera_ray(camera, pixel_center(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
+            store_render_ray(wave.queue.rays, p, ray)
+
+    return begin_aov
+
+
 def make_aov_kernel(features: Features) -> Any:
-    """Return the kernel that writes the AOVs from the closest hits of the rays that begin_aov (wave_begin.py) queued."""
+    """Return the kernel that writes the AOVs from the closest hits of the rays that begin_aov queued."""
     write_aovs = make_write_aovs(features)
 
     @kernel

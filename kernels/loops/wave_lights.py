@@ -4,9 +4,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.loops.state import Wave
-from wrt.kernels.loops.wave_normals import normal_rows
-from wrt.kernels.loops.wave_rows import DRAWN, EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, Drawn, EmitterPoint, Key
+from wrt.kernels.loops.state import DRAWN, EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, Drawn, EmitterPoint, Key, Wave
+from wrt.kernels.loops.wave_hits import normal_rows
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade import lights as kinds
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
@@ -51,7 +50,7 @@ def make_keep_diffuse(features: Features) -> Any:
 
     @wp.func
     def keep_diffuse(wave: Wave, surfaces: Surfaces, first: int, end: int) -> int:
-        rows = wave.block.rows
+        rows = wave.rows
         kept = int(0)
         for i in range(end - first):
             drawn = Drawn()
@@ -79,7 +78,7 @@ def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
     def sample_sky(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         background = lighting.background
         count = end - first
-        rows = wave.block.rows
+        rows = wave.rows
         light = lighting.count
         i = int(0)
         while i < count:
@@ -128,7 +127,7 @@ def make_sample_mesh(features: Features) -> Any:
 
     @wp.func
     def sample_mesh(wave: Wave, surfaces: Surfaces, lighting: Lighting, count: int):
-        rows = wave.block.rows
+        rows = wave.rows
         draw(rows, count)
         choose(rows, surfaces, lighting, count)
         i = int(0)
@@ -161,7 +160,7 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
 
     @wp.func
     def sky_at(wave: Wave, i: int) -> LightSample:
-        sky = load_sky(wave.block.rows, i)
+        sky = load_sky(wave.rows, i)
         sky.distant = 1
         sky.area = 1
         return sky
@@ -170,7 +169,7 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
     def light_at(wave: Wave, surfaces: Surfaces, lighting: Lighting, vertex: Vertex, light: int) -> LightSample:
         if wp.static(sampled.mesh):
             if light == 0 and first_is_mesh(lighting):
-                mesh = load_light(wave.block.rows, vertex.i)
+                mesh = load_light(wave.rows, vertex.i)
                 mesh.area = 1
                 return mesh
         if wp.static(sampled.cosine):
@@ -178,12 +177,12 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
                 return sky_at(wave, vertex.i)
         if wp.static(sampled.by_kind is not None):
             if light == lighting.count:
-                drawn = load_drawn(wave.block.rows, vertex.i)
+                drawn = load_drawn(wave.rows, vertex.i)
                 if drawn.i >= 0:
                     return sky_at(wave, drawn.i)
         if wp.static(sampled.points):
             if light == lighting.count:
-                return sample_light(lighting, surfaces, light, vertex.surface, load_point(wave.block.rows, vertex.i))
+                return sample_light(lighting, surfaces, light, vertex.surface, load_point(wave.rows, vertex.i))
         point = light_point(lighting, vertex.key.key, vertex.key.index, light)
         return sample_light(lighting, surfaces, light, vertex.surface, point)
 
@@ -195,7 +194,7 @@ class WaveLights(NamedTuple):
 
     sample: Any  # (wave, surfaces, lighting, first, end): store samples for the hits first .. end - 1, after their surfaces.
     at: Any  # The result of make_light_at.
-    needs_keys: bool  # True if `sample` reads the rows KEYS (wave_numbers.py).
+    needs_keys: bool  # True if `sample` reads the rows KEYS.
 
 
 def make_wave_lights(features: Features, sample_light: Any) -> WaveLights:

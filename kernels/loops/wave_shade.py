@@ -5,18 +5,33 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.launches import Launch, run_range
-from wrt.kernels.loops.state import BLOCK, Outcomes, Path, RayQueue, Wave, push_path, queue_next, store_sample
+from wrt.kernels.loops.state import (
+    BLOCK,
+    FACETS,
+    MISS_COLORS,
+    MISS_DIRECTIONS,
+    Outcomes,
+    Path,
+    RayQueue,
+    Wave,
+    lanes_kernel,
+    push_path,
+    queue_next,
+    store_sample,
+)
+from wrt.kernels.loops.wave_hits import (
+    make_sample_facets,
+    make_wave_normals,
+    make_wave_surfaces,
+    make_wave_textures,
+    store_keys,
+    textures_vectorised,
+)
 from wrt.kernels.loops.wave_lights import Vertex, make_wave_lights
-from wrt.kernels.loops.wave_normals import make_wave_normals
-from wrt.kernels.loops.wave_numbers import make_sample_facets, store_keys
-from wrt.kernels.loops.wave_rows import FACETS, MISS_COLORS, MISS_DIRECTIONS
-from wrt.kernels.loops.wave_surfaces import make_wave_surfaces
-from wrt.kernels.loops.wave_textures import make_wave_textures, textures_vectorised
 from wrt.kernels.query import load_render_ray, store_render_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, add_cuts, make_follow_up
-from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.paths import make_paths
 from wrt.kernels.shade.shading import Shading, make_shading
 from wrt.kernels.shade.shadows import begin_shadow
@@ -92,9 +107,9 @@ def make_add_background(features: Features) -> Any:
             if i == 0:
                 count = wp.min(BLOCK, missed - j)
                 for n in range(count):
-                    store_direction(wave.block.rows, n, wave.queue.rays.direction[wave.outcomes.missed_rays[j + n]])
-                block_radiance(lighting.background, wave.block.rows, count)
-            return load_color(wave.block.rows, i)
+                    store_direction(wave.rows, n, wave.queue.rays.direction[wave.outcomes.missed_rays[j + n]])
+                block_radiance(lighting.background, wave.rows, count)
+            return load_color(wave.rows, i)
         else:
             return radiance(lighting.background, wave.queue.rays.direction[wave.outcomes.missed_rays[j]])
 
@@ -150,9 +165,9 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
         if wp.static(compute_surfaces is not None):
             compute_surfaces(wave, surfaces, first, end, wave.progress[0].hits)
         if wp.static(sample_textures is not None):
-            sample_textures(surfaces, wave.block.rows, end - first)
+            sample_textures(surfaces, wave.rows, end - first)
         if wp.static(compute_normals is not None):
-            compute_normals(wave.block.rows, end - first)
+            compute_normals(wave.rows, end - first)
         if wp.static(needs_keys):
             store_keys(wave, first, end)
         if wp.static(features.rough):
@@ -165,7 +180,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
         i = hit.j % BLOCK
         facet = wp.vec3()
         if wp.static(features.rough):
-            facet = load_facet(wave.block.rows, i)
+            facet = load_facet(wave.rows, i)
         surface = hit_surface(wave, surfaces, i, hit.k)
         texels = texels_at(wave, surfaces, surface, i)
         surface = with_normal(surface, normal_at(wave, surfaces, surface, texels, -hit.path.direction, i))

@@ -92,7 +92,7 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
 def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
     """Replace `count` positions in the picture by colours (environment_at). Column x becomes red, row y green; blue has a third array.
 
-    The arrays begin at rows[at + n * length], n = 0, 1, 2, with room for LANES - 1 more entries. For lanes_kernel (headers.py)."""
+    The arrays begin at rows[at + n * length], n = 0, 1, 2, with room for LANES - 1 more entries. For lanes_kernel (loops/state.py)."""
 
 
 def make_environment_block(directions: Rows, colors: Rows) -> Any:

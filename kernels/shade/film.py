@@ -8,6 +8,7 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.step import Sample, mean3
 from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
+from wrt.kernels.warp_private import fields_of
 
 
 @wp.struct
@@ -25,32 +26,19 @@ class Pixel:
     clamped: float
 
 
+@wp.func_native("\n".join(f"pixel.{name} = film.{name}.data[(long long)i];" for name in fields_of(Pixel)))
+def fill(film: Film, i: int, pixel: wp.ref[Pixel]) -> None: ...
+
+
 @wp.func
 def load_pixel(film: Film, i: int) -> Pixel:
     pixel = Pixel()
-    pixel.mean = film.mean[i]
-    pixel.m2 = film.m2[i]
-    pixel.samples = film.samples[i]
-    pixel.rays = film.rays[i]
-    pixel.cut_depth = film.cut_depth[i]
-    pixel.cut_throughput = film.cut_throughput[i]
-    pixel.lost = film.lost[i]
-    pixel.not_finite = film.not_finite[i]
-    pixel.clamped = film.clamped[i]
+    fill(film, i, pixel)
     return pixel
 
 
-@wp.func
-def store_pixel(film: Film, i: int, pixel: Pixel):
-    film.mean[i] = pixel.mean
-    film.m2[i] = pixel.m2
-    film.samples[i] = pixel.samples
-    film.rays[i] = pixel.rays
-    film.cut_depth[i] = pixel.cut_depth
-    film.cut_throughput[i] = pixel.cut_throughput
-    film.lost[i] = pixel.lost
-    film.not_finite[i] = pixel.not_finite
-    film.clamped[i] = pixel.clamped
+@wp.func_native("\n".join(f"film.{name}.data[(long long)i] = pixel.{name};" for name in fields_of(Pixel)))
+def store_pixel(film: Film, i: int, pixel: Pixel) -> None: ...
 
 
 @wp.func

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, triangle_uv, world_normal
+from wrt.kernels.shade.surface import Place, corners_at, instance_at, make_triangle_at, sphere_uv, triangle_point, triangle_uv
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
 U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoff of float32.
@@ -185,19 +185,16 @@ def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) 
     return out
 
 
+flat_triangle, placed_triangle = (make_triangle_at(smooth=True, uvs=False, instances=instances) for instances in (False, True))
+
+
 @wp.func
 def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometric: wp.vec3) -> wp.vec3:
     """Return the interpolated unit normal, on the outside; `geometric` if the corners have no normals."""
-    face = surfaces.faces[place.face]
-    n0 = surfaces.normals[face[0]]
-    n1 = surfaces.normals[face[1]]
-    n2 = surfaces.normals[face[2]]
+    t = flat_triangle(surfaces, place)
     if place.instance >= 0:
-        instance = surfaces.instances[place.instance]
-        n0 = world_normal(instance, n0)
-        n1 = world_normal(instance, n1)
-        n2 = world_normal(instance, n2)
-    n = (1.0 - u - v) * n0 + u * n1 + v * n2
+        t = placed_triangle(surfaces, place)
+    n = (1.0 - u - v) * t.n0 + u * t.n1 + v * t.n2
     length = wp.length(n)
     if not length > 0.0:
         return geometric
@@ -276,14 +273,6 @@ def write_point(at: PlanePoint, out: HitPlaces, i: int):
     write(out.error, i, wp.vec3(SAFETY * (at.error + U32 * wp.abs(at.point)) + least))
 
 
-@wp.func
-def write_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, normal: wp.vec3, out: HitPlaces, i: int):
-    if out.shading.shape[0] > 0:
-        out.shading[i] = shading_normal(surfaces, place, u, v, normal)
-    if out.uv.shape[0] > 0:
-        out.uv[i] = triangle_uv(surfaces, place.face, u, v)
-
-
 @kernel
 def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
     """Write the results of the hits first .. first + dim - 1, for the launch size dim. An invalid prim_id is a miss."""
@@ -312,4 +301,7 @@ def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits:
         write_point(at, out, i)
         normal = wp.vec3(wp.normalize(at.normal / longest(at.normal)))
         write(out.normal, i, normal)
-        write_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)
+        if out.shading.shape[0] > 0:
+            out.shading[i] = shading_normal(surfaces, place, hits.u[i], hits.v[i], normal)
+        if out.uv.shape[0] > 0:
+            out.uv[i] = triangle_uv(surfaces, place.face, hits.u[i], hits.v[i])

@@ -152,18 +152,26 @@ def is_within(light: Light, s: Surface, to_center: wp.vec3) -> bool:
 
 
 @wp.func
+def crossing(light: Light, s: Surface, wi: wp.vec3, to_center: wp.vec3, side: float) -> wp.vec3:
+    """Return the end of a shadow ray to a sphere light: the first crossing (side = -1) or, from inside, the second (side = 1).
+
+    The point is moved towards the ray's origin by more than the rounding error of the crossing."""
+    along = wp.dot(wi, to_center)
+    across = to_center - along * wi
+    half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
+    n = wp.normalize(s.point + (along + side * half_chord) * wi - light.position)
+    extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
+    return spawn_point(light.position + light.radius * n, wp.static(16.0 * 2.0**-24) * extent, n, -side * n)
+
+
+@wp.func
 def sphere_light_from_within(light: Light, s: Surface, to_center: wp.vec3, xi: wp.vec2) -> LightSample:
     """Sample the hemisphere of s by the cosine: all directions meet the sphere's inside. A one-sided light gives no light there."""
     sample = LightSample()
     if light.two_sided == 0:
         return sample
     sample.wi = cosine_hemisphere(xi, s.shading)
-    along = wp.dot(sample.wi, to_center)
-    across = to_center - along * sample.wi
-    half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
-    n = wp.normalize(s.point + (along + half_chord) * sample.wi - light.position)
-    extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
-    sample.end = spawn_point(light.position + light.radius * n, wp.static(16.0 * 2.0**-24) * extent, n, -n)
+    sample.end = crossing(light, s, sample.wi, to_center, 1.0)
     sample.weight = light.color * (PI / wp.max(wp.dot(sample.wi, s.shading), 1.0e-9))
     sample.area = 1
     return sample
@@ -188,13 +196,7 @@ def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surfac
     x = frame_x(axis)
     around = sin_theta * point_at(TWO_PI * xi[1])
     sample.wi = wp.normalize((1.0 - h) * axis + around[0] * x + around[1] * wp.cross(axis, x))
-    # The shadow ray ends at its first crossing with the sphere, moved outwards by more than the crossing's rounding error.
-    along = wp.dot(sample.wi, to_center)
-    across = to_center - along * sample.wi
-    half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
-    n = wp.normalize(s.point + (along - half_chord) * sample.wi - light.position)
-    extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
-    sample.end = spawn_point(light.position + light.radius * n, wp.static(16.0 * 2.0**-24) * extent, n, n)
+    sample.end = crossing(light, s, sample.wi, to_center, -1.0)
     sample.weight = light.color * (TWO_PI * one_minus_cos)
     sample.area = 1
     return sample

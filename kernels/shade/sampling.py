@@ -101,14 +101,14 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 @wp.func_native("wrt::sample_2d(seed, first, count, (float*)(out.data + (long long)at));")
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
-    """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ... For kernels with lanes_kernel (headers.py).
+    """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ... For kernels with lanes_kernel.
 
     `seed` is hash_pair(key, dimension). `out` must have room for LANES - 1 more points, which are overwritten."""
 
 
 @wp.func_native("wrt::quantile(icdf.data, icdf.shape[0], (float*)(points.data + (long long)first), 2 * count);")
 def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
-    """Replace both coordinates of the points first .. first + count - 1 by `quantile`. For kernels with lanes_kernel (headers.py)."""
+    """Replace both coordinates of the points first .. first + count - 1 by `quantile`. For kernels with lanes_kernel."""
 
 
 @wp.func
@@ -189,7 +189,7 @@ def triangle(xi: wp.vec2) -> wp.vec2:
 
 @wp.func
 def where_vec3(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Choose a or b component by component: wp.where of vectors does not vectorise (kernels.memory)."""
+    """Choose a or b component by component: wp.where of vectors does not vectorise (kernels.rows)."""
     return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
 
 

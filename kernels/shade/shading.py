@@ -1,66 +1,20 @@
 """The data at a hit: the surface, its material with textures, its shading normal, and its scattering."""
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import warp as wp
 
+from wrt.kernels.parameters import PARAMETERS, TEXTURES, Material, MaterialTexture, Texels
 from wrt.kernels.rows import numbers_of
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import make_scatter
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.surface import MIN_COSINE, Surface, make_place_of, make_surface_at, triangle_uv, visible_normal
 from wrt.kernels.shade.textures import make_sample_texture
-from wrt.kernels.structs import Material, Surfaces, unit
-from wrt.kernels.warp_private import fields_of
+from wrt.kernels.structs import Surfaces, unit
 
 MASK, BLEND = 1, 2  # Values of Material.alpha_mode; 0 is opaque.
-
-
-@wp.struct
-class Texels:
-    """The linear values of a material's textures at a point; 1 without a texture. Fields are unread if no material has the texture."""
-
-    albedo: wp.vec3
-    alpha: float
-    emission: wp.vec3
-    roughness: float
-    metallic: float
-    transmission: float
-    specular_factor: float
-    specular_color: wp.vec3
-    clearcoat: float
-    clearcoat_roughness: float
-    normal: wp.vec3
-
-
-class MaterialTexture(NamedTuple):
-    """A texture of a material. fields: neighbouring fields of Texels, and the channels (of "rgba") that each field takes."""
-
-    fields: dict[str, str]
-    feature: str = "parameter_textures"  # The field of Features that compiles it in; "": compiled in with any texture.
-
-    @property
-    def channels(self) -> list[int]:
-        return ["rgba".index(channel) for channels in self.fields.values() for channel in channels]
-
-    @property
-    def components(self) -> list[str]:
-        """The component of Texels that each channel sets, as a C++ expression."""
-        return [component for name in self.fields for component in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
-
-
-# A material's textures, for both loops. The keys are the fields of Material that hold the textures' indices.
-TEXTURES = {
-    "albedo_texture": MaterialTexture({"albedo": "rgb", "alpha": "a"}, ""),
-    "emission_texture": MaterialTexture({"emission": "rgb"}, ""),
-    "metallic_roughness_texture": MaterialTexture({"roughness": "g", "metallic": "b"}),
-    "transmission_texture": MaterialTexture({"transmission": "r"}),
-    "specular_texture": MaterialTexture({"specular_factor": "a"}, "specular"),
-    "specular_color_texture": MaterialTexture({"specular_color": "rgb"}, "specular"),
-    "clearcoat_texture": MaterialTexture({"clearcoat": "r"}, "clearcoat"),
-    "clearcoat_roughness_texture": MaterialTexture({"clearcoat_roughness": "g"}, "clearcoat"),
-    "normal_texture": MaterialTexture({"normal": "rgb"}, "normal_maps"),
-}
 
 
 def textures_of(features: Features) -> dict[str, MaterialTexture]:
@@ -68,6 +22,11 @@ def textures_of(features: Features) -> dict[str, MaterialTexture]:
     if not features.textures and not features.checkerboards:
         return {}
     return {name: texture for name, texture in TEXTURES.items() if not texture.feature or getattr(features, texture.feature)}
+
+
+def numbers_in(names: Iterable[str], struct: str) -> list[str]:
+    """Return the C++ expressions of the numbers of these parameters in the variable `struct`."""
+    return [number for name in names for number in numbers_of(PARAMETERS[name].dtype, f"{struct}.{name}")]
 
 
 def make_look_up(features: Features) -> Any:
@@ -86,11 +45,12 @@ def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
 
 def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
     """Return a function look_up that calls the look_up function `others` and then samples one more texture."""
+    numbers = zip(texture.channels, numbers_in(texture.parameters, "texels"), strict=True)
 
     @wp.func_native(f"return materials.data[(long long)material].{name};")
     def index_of(materials: wp.array(dtype=Material), material: int) -> int: ...
 
-    @wp.func_native("\n".join(f"{to} = color[{channel}];" for channel, to in zip(texture.channels, texture.components, strict=True)))
+    @wp.func_native("\n".join(f"{number} = color[{channel}];" for channel, number in numbers))
     def store_color(texels: wp.ref[Texels], color: wp.vec4) -> None: ...
 
     @wp.func
@@ -104,25 +64,22 @@ def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, 
 
 def make_resolve(features: Features) -> Any:
     """Return resolve(surfaces, surface, texels) -> Material at a point: parameters times textures."""
-    textured = features.textures or features.checkerboards
+    names = [name for texture in textures_of(features).values() for name in texture.parameters if PARAMETERS[name].is_factor]
+    numbers = zip(numbers_in(names, "material"), numbers_in(names, "texels"), strict=True)
+
+    @wp.func_native("\n".join(f"{number} = {number} * {texel};" for number, texel in numbers))
+    def multiply(texels: Texels, material: wp.ref[Material]) -> None: ...
+
+    @wp.func_native("material = materials.data[(long long)i];")
+    def load(materials: wp.array(dtype=Material), i: int, material: wp.ref[Material]) -> None: ...
 
     @wp.func
     def resolve(surfaces: Surfaces, s: Surface, texels: Texels) -> Material:
-        m = surfaces.materials[s.material]
-        if wp.static(textured):
-            m.albedo = wp.cw_mul(m.albedo, texels.albedo)
-            m.alpha = m.alpha * texels.alpha
-            m.emission = wp.cw_mul(m.emission, texels.emission)
-        if wp.static(features.parameter_textures):
-            m.roughness = m.roughness * texels.roughness
-            m.metallic = m.metallic * texels.metallic
-            m.transmission = m.transmission * texels.transmission
-        if wp.static(textured and features.specular):
-            m.specular_factor = m.specular_factor * texels.specular_factor
-            m.specular_color = wp.cw_mul(m.specular_color, texels.specular_color)
-        if wp.static(textured and features.clearcoat):
-            m.clearcoat = m.clearcoat * texels.clearcoat
-            m.clearcoat_roughness = m.clearcoat_roughness * texels.clearcoat_roughness
+        if wp.static(not names):
+            return surfaces.materials[s.material]
+        m = Material()
+        load(surfaces.materials, s.material, m)
+        multiply(texels, m)
         return m
 
     return resolve

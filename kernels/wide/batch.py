@@ -11,8 +11,8 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.hit_lists import HitLists
-from wrt.kernels.memory import put_int
 from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.rows import put_int
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.stack import reference_of, t_of

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.headers import with_headers
-from wrt.kernels.memory import put_int
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
+from wrt.kernels.rows import put_int
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import put_number
+from wrt.kernels.rows import put_number
 from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.wide.lanes import bits, lowest

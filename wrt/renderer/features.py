@@ -4,8 +4,8 @@ import math
 
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.core.types import JsonObject
+from wrt.kernels.parameters import TEXTURES
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.shading import TEXTURES
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS

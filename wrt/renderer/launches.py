@@ -20,7 +20,7 @@ from wrt.core.device import launch_on, made_once, records, start, upload
 from wrt.core.threads import FreeList
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 from wrt.kernels.launches import Launch
-from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
+from wrt.kernels.loops import state, wave, wave_shade
 from wrt.kernels.loops.one_ray import Tile, add_samples
 from wrt.kernels.loops.state import BLOCK
 from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
@@ -106,11 +106,11 @@ def keep_only(features: Features, names: tuple[str, ...]) -> Features:
     return Features(**{name: getattr(features, name) for name in names})
 
 
-begin_kernel = made_once(wave_begin.make_begin_kernel)
+begin_kernel = made_once(wave.make_begin_kernel)
 shade_kernels = made_once(wave_shade.make_shade_kernels)
 shadow_kernel = made_once(wave.make_shadow_kernel)
 aov_kernel = made_once(wave.make_aov_kernel)
-begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
+begin_aov_kernel = made_once(wave.make_begin_aov_kernel)
 
 
 @made_once
@@ -136,9 +136,9 @@ class WaveKernels:
     closest_hit: Kernel
     any_hit: Kernel | None  # For shadow rays in scenes without transparent shadows.
     shadow: Kernel | None  # shadow_wave (wave.py), in scenes with transparent shadows.
-    begin: Kernel  # begin_wave (wave_begin.py).
+    begin: Kernel  # begin_wave (wave.py).
     loop: Kernel  # trace_wave (wave.py).
-    begin_aov: Kernel | None  # begin_aov (wave_begin.py).
+    begin_aov: Kernel | None  # begin_aov (wave.py).
     aov: Kernel | None  # aov_wave (wave.py).
     block: int  # Rays per thread of the traversals: ALL or 1.
 
@@ -218,7 +218,7 @@ class Buffers:
         w.queue.sample, w.queue.rays, w.queue.hits = empty(n, wp.int32), empty_rays(n), empty_hits(n)
         w.outcomes.hit_rays, w.outcomes.missed_rays, w.outcomes.resumed_samples = (empty(n, wp.int32) for _ in range(3))
         self.allocate_shadows(features.transparent_shadows, lights)
-        w.block.rows = empty(wave_rows.ROWS * BLOCK, wp.float32)
+        w.rows = empty(state.ROWS * BLOCK, wp.float32)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def allocate_shadows(self, transparent: bool, lights: int) -> None:

@@ -10,7 +10,7 @@ import warp as wp
 from wrt.accel.queries.rays import to_origin
 from wrt.core.checks import as_one, as_size
 from wrt.core.device import launch, made_once, start, upload
-from wrt.kernels.shade.pixel_rays import make_camera_rays_kernel
+from wrt.kernels.shade.cameras import make_camera_rays_kernel
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import CameraKind
 from wrt.scene.far import moved_camera

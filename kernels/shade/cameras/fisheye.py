@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.shade.cameras import no_ray
 from wrt.kernels.shade.elementary import sin_cos
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.pixel_rays import no_ray
 from wrt.kernels.structs import Ray, make_ray
 
 

@@ -16,8 +16,15 @@ from wrt.core.device import upload
 from wrt.kernels import structs
 from wrt.kernels.shade import materials
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
-from wrt.kernels.shade.materials import Scatter, blinn_phong, make_scatter
+from wrt.kernels.shade.materials import (
+    Scatter,
+    blinn_phong,
+    fresnel_conductor,
+    fresnel_dielectric,
+    fresnel_schlick,
+    fresnel_tint,
+    make_scatter,
+)
 from wrt.kernels.shade.sampling import cap_point
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import kernel

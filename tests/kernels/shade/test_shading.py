@@ -10,9 +10,10 @@ import warp as wp
 
 from wrt.core.device import records
 from wrt.kernels import structs
+from wrt.kernels.parameters import TEXTURES, Texels
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.shading import TEXTURES, Texels, make_resolve, textures_of
+from wrt.kernels.shade.shading import make_resolve, textures_of
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.warp_private import fields_of
@@ -33,15 +34,14 @@ def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
     """The wave loop stores the channels of a texture in adjacent rows, so that its fields must be neighbours in Texels."""
     rows, seen = Rows(Texels, 64), []
     for texture in TEXTURES.values():
-        fields = [rows.field(name) for name in texture.fields]
+        fields = [rows.field(name) for name in texture.parameters]
         assert [each.end for each in fields[:-1]] == [each.first for each in fields[1:]]
-        assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.components)
-        assert texture.channels == sorted(texture.channels)
-        seen += texture.fields
+        assert fields[-1].end - fields[0].first == len(texture.channels)
+        assert list(texture.channels) == sorted(texture.channels)
+        seen += texture.parameters
     assert sorted(seen) == sorted(fields_of(Texels))
-    metallic_roughness, albedo = TEXTURES["metallic_roughness_texture"], TEXTURES["albedo_texture"]
-    assert metallic_roughness.channels == [1, 2] and metallic_roughness.components == ["texels.roughness", "texels.metallic"]
-    assert albedo.channels == [0, 1, 2, 3] and albedo.components[1:] == ["texels.albedo[1]", "texels.albedo[2]", "texels.alpha"]
+    assert TEXTURES["metallic_roughness_texture"][:2] == (("roughness", "metallic"), (1, 2))
+    assert TEXTURES["albedo_texture"][:2] == (("albedo", "alpha"), (0, 1, 2, 3))
 
 
 @pytest.mark.parametrize("name", SLOTS)

@@ -19,17 +19,15 @@ from tests.data import ROOT
 from tests.kernels.shade.test_lights import environment_kernel
 from tests.kernels.shade.test_textures import look_up, picture, surfaces_with
 from wrt.core.device import records, upload
-from wrt.kernels.loops.state import BLOCK
+from wrt.kernels.loops.state import BLOCK, HEADERS, lanes_kernel
 from wrt.kernels.loops.wave import add_to_pixels
-from wrt.kernels.loops.wave_textures import make_sample_texture
+from wrt.kernels.loops.wave_hits import make_sample_texture
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade import backgrounds, sampling, textures
 from wrt.kernels.shade import film as film_file
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import add_sample, load_pixel, store_pixel
-from wrt.kernels.shade.headers import HEADERS, lanes_kernel
 from wrt.kernels.shade.sampling import LANES, make_draw, quantile, quantiles, sample_2d
-from wrt.kernels.shade.shading import TEXTURES
 from wrt.kernels.shade.step import Sample
 from wrt.kernels.structs import Background, Film, Surfaces, kernel
 from wrt.renderer.upload import upload_scene
@@ -260,7 +258,7 @@ class Twin(NamedTuple):
 TWINS = (
     Twin(sampling.sample_points, sampling, "sample_2d", check_points),
     Twin(quantiles, sampling, "quantile", check_quantiles),
-    Twin(make_sample_texture("albedo_texture", TEXTURES["albedo_texture"]), textures, "sample_texture", check_textures),
+    Twin(make_sample_texture("albedo_texture"), textures, "sample_texture", check_textures),
     Twin(backgrounds.environment_colors, backgrounds, "environment_at", check_environment),
     Twin(backgrounds.environment_places, backgrounds, "environment_place", check_places),
     Twin(add_to_pixels, film_file, "add_sample", check_film),

@@ -14,7 +14,7 @@ import pytest
 from tests.command_line import BOX_OBJ, wrt
 from wrt.core.compiling import COMPILING
 from wrt.renderer.options import Progress
-from wrt.renderer.progress import BUILDING, LINE_EVERY, TimeLeft, describe, progress_reporter
+from wrt.renderer.progress import BUILDING, LINE_EVERY, describe, progress_reporter
 
 
 def at(seconds: float, done: int = 50) -> Progress:
@@ -30,22 +30,6 @@ def at(seconds: float, done: int = 50) -> Progress:
 ])
 def test_rays_a_second_and_time_left(progress: Progress, expected: str) -> None:
     assert describe(progress) == expected
-
-
-def test_the_time_left_of_work_of_known_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 100.0
-    monkeypatch.setattr("wrt.renderer.progress.time.perf_counter", lambda: now)
-    left = TimeLeft(8.0)
-    assert str(left) == ""
-    now, left.done = 130.0, 2.0
-    assert str(left) == ", about 1:30 left"
-    left.done = 9.0  # more than the expected total
-    assert str(left) == ", about 0:00 left"
-
-
-def test_quiet_is_silent() -> None:
-    with progress_reporter(True) as report:
-        assert report is None
 
 
 def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,30 +48,24 @@ def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytes
 
 def test_a_process_without_stderr_prints_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """If stderr is closed, `print` would write to stdout, which is for data."""
+    with progress_reporter(quiet=True) as report:
+        assert report is None
     monkeypatch.setattr(sys, "stderr", None)
     with progress_reporter(False) as report:
         assert report is None
 
 
-def test_compiling_is_reported_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_and_building_are_reported_too(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stderr)
     with progress_reporter(False) as report:
         assert report is not None
         report(Progress(0, 200, 0, 0.0, stage="compile"))
-    assert stderr.getvalue() == f"{COMPILING}\n"
-
-
-def test_building_is_reported_every_ten_seconds_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    stderr = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", stderr)
-    with progress_reporter(False) as report:
-        assert report is not None
         for second in range(1, 15):
             report(Progress(2 * second, 100, 0, float(second), stage="build"))
         for second in range(1, 11):
             report(at(float(second)))
-    assert stderr.getvalue().splitlines() == [f"20 %, {BUILDING}", "25 %, 4.0 Mray/s, 0:30 left"]
+    assert stderr.getvalue().splitlines() == [COMPILING, f"20 %, {BUILDING}", "25 %, 4.0 Mray/s, 0:30 left"]
 
 
 def test_a_closed_terminal_does_not_end_a_render(monkeypatch: pytest.MonkeyPatch) -> None:
