@@ -13,7 +13,7 @@ from wrt.kernels.loops.record import begin_light, end_light, last_ray, make_reco
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import Pixel, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
+from wrt.kernels.shade.film import AovFilm, Film, Pixel, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
 from wrt.kernels.shade.follow_up import FOLLOWED, add_cuts, make_follow_up
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
@@ -21,7 +21,7 @@ from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.shade.shadows import make_transmittance
 from wrt.kernels.shade.step import DirectLight, Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
 from wrt.kernels.shade.surface import with_normal
-from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
+from wrt.kernels.structs import Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
 
 
 @wp.struct

@@ -26,12 +26,12 @@ from wrt.kernels.loops.state import BLOCK, Task, Wave, lanes_kernel, store_sampl
 from wrt.kernels.query import load_hit, load_render_ray, store_render_ray
 from wrt.kernels.rows import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
+from wrt.kernels.shade.film import AovFilm, Film, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
 from wrt.kernels.shade.sampling import LANES, hash_pair, make_draw, quantiles
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import make_advance_shadow
 from wrt.kernels.shade.step import DirectLight, Sample, add_light, add_surface_light
-from wrt.kernels.structs import AovFilm, Film, Limits, Surfaces, kernel, noinline
+from wrt.kernels.structs import Limits, Surfaces, kernel, noinline
 
 FRESH = 2048  # Number of camera rays that are made, traced and shaded together, so that they stay in the cache.
 

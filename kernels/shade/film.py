@@ -7,13 +7,52 @@ import warp as wp
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.step import Sample, mean3
-from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
+from wrt.kernels.structs import Hit, Ray, Surfaces
 from wrt.kernels.warp_private import fields_of
 
 
 @wp.struct
+class Film:
+    """Running mean, sum of squared deviations (Welford 1962), number of samples, and cost of each pixel, row by row.
+    The arrays hold the rectangle of the image that begins at pixel (x, y) and is `columns` pixels wide."""
+
+    width: int  # width, height: size of the whole image in pixels.
+    height: int
+    x: int
+    y: int
+    columns: int
+    mean: wp.array(dtype=wp.vec3)  # Running mean of the samples' radiance.
+    m2: wp.array(dtype=wp.vec3)  # Sum of squared deviations from the mean.
+    samples: wp.array(dtype=wp.int32)  # Number of samples.
+    rays: wp.array(dtype=wp.int64)  # Number of closest-hit and any-hit rays.
+    cut_depth: wp.array(dtype=wp.int32)  # Number of rays cut by max_depth.
+    cut_throughput: wp.array(dtype=wp.int32)  # Number of rays cut by min_throughput.
+    lost: wp.array(dtype=wp.float32)  # Sum of the throughputs of the cut rays, each averaged over the colour channels.
+    not_finite: wp.array(dtype=wp.int32)  # Number of samples that were NaN or infinite; they enter the mean as 0.
+    clamp: float  # Largest radiance of a sample in any channel; brighter samples are scaled down to it. 0: no limit.
+    clamped: wp.array(dtype=wp.float32)  # Sum of the radiance that this took from samples, averaged over the colour channels.
+    filter_icdf: wp.array(dtype=wp.float32)  # Inverse cumulative distribution of the pixel filter along x or y, in pixels.
+
+
+@wp.struct
+class AovFilm:
+    """Layers of the first hit of the ray through each pixel's centre (wrt.picture.film.Film). width .. columns: as in Film."""
+
+    width: int
+    height: int
+    x: int
+    y: int
+    columns: int
+    depth: wp.array(dtype=wp.float32)
+    normal: wp.array(dtype=wp.vec3)
+    albedo: wp.array(dtype=wp.vec3)
+    prim_id: wp.array(dtype=wp.int32)
+    material_id: wp.array(dtype=wp.int32)
+
+
+@wp.struct
 class Pixel:
-    """A local copy of one pixel of a Film (kernels/structs.py), whose arrays have the same names."""
+    """A local copy of one pixel of a Film, whose arrays have the same names."""
 
     mean: wp.vec3
     m2: wp.vec3

@@ -14,9 +14,10 @@ from tests.kernels.shade.test_textures import picture, surfaces_with, texture_ke
 from tests.kernels.shade.test_twins import OF_FILM, pixel_kernel, quantile_kernel
 from wrt.core.device import records, upload
 from wrt.kernels.shade.backgrounds import environment_at
+from wrt.kernels.shade.film import Film
 from wrt.kernels.shade.sampling import LANES, hash_pair, sample_2d
 from wrt.kernels.shade.step import Sample
-from wrt.kernels.structs import Background, Film, kernel
+from wrt.kernels.structs import Background, kernel
 from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.materials import Texture

@@ -11,7 +11,7 @@ import warp as wp
 
 from wrt.core.device import upload
 from wrt.core.types import Device, WarpArray
-from wrt.kernels import structs
+from wrt.kernels.shade import film as device_film
 from wrt.scene.settings import MAX_DEPTH, Settings
 
 Rectangle = tuple[int, int, int, int]  # x, y, width, height
@@ -91,7 +91,7 @@ class DeviceFilm:
         self.groups = []
         for _ in self.seeds:
             own = {name: wp.zeros(n, dtype=dtype, device=device) for name, dtype in OF_A_GROUP.items()}
-            film = structs.Film()
+            film = device_film.Film()
             film.width, film.height = settings.size
             film.x, film.y, film.columns = x0, y0, x1 - x0
             film.clamp = settings.clamp
@@ -199,7 +199,7 @@ class AovFilm:
     def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Device) -> None:
         x0, y0, x1, y1 = crop
         self.shape = y1 - y0, x1 - x0
-        self.struct = structs.AovFilm()
+        self.struct = device_film.AovFilm()
         self.struct.width, self.struct.height = settings.size
         self.struct.x, self.struct.y, self.struct.columns = x0, y0, x1 - x0
         for name, dtype in OF_AOVS.items():

@@ -26,10 +26,10 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade import backgrounds, sampling, textures
 from wrt.kernels.shade import film as film_file
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.film import add_sample, load_pixel, store_pixel
+from wrt.kernels.shade.film import Film, add_sample, load_pixel, store_pixel
 from wrt.kernels.shade.sampling import LANES, make_draw, quantile, quantiles, sample_2d
 from wrt.kernels.shade.step import Sample
-from wrt.kernels.structs import Background, Film, Surfaces, kernel
+from wrt.kernels.structs import Background, Surfaces, kernel
 from wrt.renderer.upload import upload_scene
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.materials import Texture

@@ -18,7 +18,10 @@ import pytest
 
 import wrt
 from tests.command_line import BOX_OBJ
+from tests.data import ROOT
+from tests.device import NAME
 from tests.refused import Refusal, refused
+from wrt.core import device as core_device
 from wrt.core.compiling import COMPILING, Watch
 from wrt.core.errors import SceneWarning
 from wrt.io.load import load_scene
@@ -516,3 +519,22 @@ def test_a_tree_is_refined_for_many_samples_without_changing_pixels(tmp_path: Pa
     more = render(few, spp=many, aov=["prim_id"], checkpoint=path, resume=True)  # with the tree of the other builder
     assert more.stats["accel"] | {"build_seconds": 0.0} == films[1].stats["accel"] | {"build_seconds": 0.0}
     assert same(more, render(few, spp=many, aov=["prim_id"]))
+
+
+# --- kernels compiled ahead of time -----------------------------------------------------------------------------------
+
+
+def test_a_render_finds_its_kernels_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(ROOT / "scenes" / "fisheye.toml").with_settings(size=(8, 8), spp=1, max_depth=7)
+    names = prepare.compile_picture(scene, "bvh")
+    assert ({"shade_wave", "begin_wave", "aov_wave", "trace"} if NAME == "cpu" else {"render", "aovs"}) <= set(names)
+    asked: list[Any] = []
+    monkeypatch.setattr(prepare, "load_kernel", lambda kernel, target: asked.append(kernel))
+    render(scene, aov=AOVS)
+    assert len(asked) == len(names) and all(NAME in dict(core_device._loaded[kernel].devices) for kernel in asked)
+
+
+def test_queries_of_a_structure_and_wrong_names() -> None:
+    assert prepare.compile_queries("bvh") == ["closest_hit", "any_hit"]
+    with refused("accel", "nosuch"):
+        prepare.compile_queries("nosuch")
