@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 
 
 def place(*meshes: tuple[Geometry, np.ndarray]) -> InstancedGeometry:

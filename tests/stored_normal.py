@@ -6,7 +6,7 @@ docs/extending.md links to this file, and tests/test_extending.py builds structu
 import numpy as np
 import warp as wp
 
-from wrt.accel.triangle_data import LAYOUTS
+from wrt.accel.geometry import LAYOUTS
 from wrt.kernels.structs import Hit, Ray
 from wrt.kernels.units.box import BoxRay
 from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, TriangleTest, no_triangle

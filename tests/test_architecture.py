@@ -37,10 +37,10 @@ BELOW_WRT = {
 # The layers of wrt/accel, lowest first: a module imports from its own layer and from lower layers. A module that is named nowhere is
 # in the layer of "bvh". Queries are below the structures, because the methods of structures call them.
 LAYERS_OF_ACCEL = (
-    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "flat_scene"},  # geometry
-    {"structures", "structure", "built", "snapshot"},  # kinds of structures, and the state of a structure
+    {"geometry", "device_geometry", "flat_scene"},  # geometry
+    {"structures", "snapshot"},  # kinds of structures, and the state of a structure
     {"queries"},
-    {"store", "scene_arrays", "base", "box_tree", "tree_exchange", "epo", "tensors"},
+    {"store", "scene_arrays", "base", "box_tree", "tensors"},
     {"bvh", "cells", "brute_force"},
     {"top_level", "instances"},
     {"scenes"},

@@ -15,7 +15,7 @@ import wrt
 from tests.data import ROOT
 from wrt.accel.queries.all_hits import list_hits
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.snapshot import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.cli.common import depth_hint
 from wrt.core.device import start

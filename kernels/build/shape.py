@@ -1,5 +1,5 @@
 """Compute the boxes and records of triangles and spheres on any device, so that a moving mesh need not leave the GPU.
-The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.triangle_data.corners). `write_rows`
+The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.geometry.corners). `write_rows`
 is for CPUs.
 A launch of size dim processes the primitives or records first .. first + dim - 1."""
 

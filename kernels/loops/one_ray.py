@@ -123,7 +123,7 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
 
 
 def make_traversals(features: Features, structure: Any) -> Any:
-    """Return closest_hit and any_hit of a structure (wrt.accel.structure.Structure), which ignore hits on the clear parts of
+    """Return closest_hit and any_hit of a structure (wrt.accel.snapshot.Structure), which ignore hits on the clear parts of
     cut-outs."""
     accepts = make_cutout(features)
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)

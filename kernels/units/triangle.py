@@ -204,7 +204,7 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     bits in float-float arithmetic; float64 decides only where the bits are uncertain.
 
     The line misses a triangle exactly edge-on, and a triangle with a NaN coordinate. A triangle without area is stored with NaN, because
-    here the rounded shear could give it an area (wrt.accel.triangle_data.corners).
+    here the rounded shear could give it an area (wrt.accel.geometry.corners).
 
     Domain: coordinates differ by less than 2^127, and the direction's longest component is between 2^-64 and 2^64 (`kernels.query` scales
     other directions). wrt.lab.oracle.bounds has the error bounds.
@@ -378,7 +378,7 @@ class TriangleTest(NamedTuple):
 
     intersect: Any  # Function (BoxRay, TriangleRay, Ray, record) -> Hit.
     record: Any  # Primitive or PlanePrimitive.
-    layout: str  # Name in wrt.accel.triangle_data.LAYOUTS of the function that converts corners to records.
+    layout: str  # Name in wrt.accel.geometry.LAYOUTS of the function that converts corners to records.
     uses_shear: bool = False  # True if `intersect` reads the TriangleRay.
 
 

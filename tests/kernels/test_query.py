@@ -10,7 +10,7 @@ from tests.structures import STRUCTURES, families_first  # isort: skip
 import warp as wp
 
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import HitArrays, RayArrays, make_any_hit_kernel, make_closest_hit_kernel
 from wrt.kernels.structs import Ray, Surfaces, kernel, make_ray

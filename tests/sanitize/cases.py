@@ -14,7 +14,7 @@ import warp as wp
 from wrt.accel.queries.all_hits import ALL, list_hits
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import any_hit_kernel, closest_hit_kernel
+from wrt.accel.snapshot import any_hit_kernel, closest_hit_kernel
 from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit

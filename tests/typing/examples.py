@@ -12,7 +12,6 @@ import warp as wp
 import wrt
 from wrt.accel.base import OneMesh
 from wrt.accel.brute_force import BruteForce
-from wrt.accel.built import AccelStats, Refit
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.wide import Bvh4, Bvh8
 from wrt.accel.cells.grid import Grid
@@ -21,6 +20,7 @@ from wrt.accel.points.closest_points import ClosestPoints
 from wrt.accel.queries.all_hits import AllHits
 from wrt.accel.queries.answers import Counters, Hits
 from wrt.accel.queries.gradients import Gradients
+from wrt.accel.snapshot import AccelStats, Refit
 from wrt.core.types import WarpArray
 from wrt.lab.rtcore.profiler import Profile
 from wrt.scene.shapes import box, icosphere

@@ -158,7 +158,7 @@ def geometry(vertices: np.ndarray, faces: np.ndarray) -> Geometry:
 
 
 def instances(vertices: np.ndarray, faces: np.ndarray, **arrays: np.ndarray) -> Any:
-    from wrt.accel.instanced_geometry import InstancedGeometry
+    from wrt.accel.geometry import InstancedGeometry
 
     return wrt.build(InstancedGeometry((geometry(vertices, faces),), **arrays, n_triangles=2 * len(faces)))
 

@@ -12,16 +12,15 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import AccelStats, Built, Refit
+from wrt.accel.box_tree import BoxTree, end_point_overlap, nested
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.queries.rays import vectors
-from wrt.accel.snapshot import Snapshot
+from wrt.accel.snapshot import AccelStats, Built, Refit, Snapshot, Structure
 from wrt.accel.store import check_order, save
-from wrt.accel.structure import Structure, options_of
-from wrt.accel.tree_exchange import TreeExchange
+from wrt.accel.structures import options_of
 from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers
 from wrt.core.building import build_clock, report_parts
 from wrt.core.device import upload
@@ -36,7 +35,7 @@ from wrt.scene.values import as_number, near_zero, warn_if_far
 MeshT = TypeVar("MeshT", bound="OneMesh")
 
 
-class OneMesh(TreeExchange, ABC):
+class OneMesh(Accelerator, ABC):
     """An acceleration structure over one mesh. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
     record: Warp struct of a primitive. units: kernels.traverse.common.Units. accepts: Warp function that can reject hits. A module
@@ -49,6 +48,7 @@ class OneMesh(TreeExchange, ABC):
     stream: ClassVar[KernelModule | None] = None  # Module of a CPU kernel that traces many rays at a time.
     options: ClassVar[type[Any]]  # A frozen dataclass, which raises InputError for values out of range.
     build_all: ClassVar[Callable[..., list[Built]] | None] = None  # (structures, options), if it is faster than `_build` of each.
+    built_with: Any  # an instance of `options`
     can_refit: ClassVar[bool] = False  # True if `_refit` is implemented.
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
@@ -66,6 +66,22 @@ class OneMesh(TreeExchange, ABC):
         Accelerator.__init__(self, Structure(cls, units or Units()), geometry, attributes, device, threads)
         self.built_with, begin = cls.options() if built_with is None else built_with, build_clock()
         check_order(built.order, len(geometry), cls.name)
+        self._check(built)
+        self._install(built, begin, built.sah_cost)
+        return self
+
+    @classmethod
+    def from_tree(cls, tree: BoxTree, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
+                  threads: int | None = None, *, spatial_splits: bool = False) -> Self:
+        """Make a structure from another builder's tree, as wrt.accel_from_tree does.
+
+        Raises InputError if the tree is not a tree over the geometry, or the structure cannot hold it.
+        """
+        self = cls.__new__(cls)
+        Accelerator.__init__(self, Structure(cls, Units()), geometry, attributes, device, threads)
+        self.built_with = cls.options()
+        begin = build_clock()
+        built = self._built_of(tree.checked(geometry, spatial_splits))
         self._check(built)
         self._install(built, begin, built.sah_cost)
         return self
@@ -176,6 +192,29 @@ class OneMesh(TreeExchange, ABC):
             self._snapshot = replace(beside._snapshot, followed=followed)
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
+    def tree(self) -> BoxTree:
+        """Return the tree of a BVH as plain arrays, the same for all BVHs; `wrt.accel_from_tree` takes it back.
+
+        Returns
+        -------
+        BoxTree
+            Boxes, children and primitives of the nodes. `tree().save("tree.npz")` writes a file that NumPy reads. Spheres and 14-DOPs
+            appear as boxes, and boxes of few bits as boxes that contain their children's.
+
+        Raises
+        ------
+        InputError
+            If the structure is not a BVH.
+        """
+        return nested(self._box_tree(self.built))
+
+    def _box_tree(self, built: Built) -> BoxTree:
+        raise InputError(f"a {self.name} has no tree of boxes", hint="use a BVH")
+
+    def _built_of(self, tree: BoxTree) -> Built:
+        """Convert a tree, whose boxes contain the padded primitives."""
+        raise InputError(f"a {self.name} cannot be made from a tree of boxes", argument="accel", hint="use a BVH")
+
     def _children(self, built: Built) -> WarpStruct:
         """Convert a hierarchy of boxes to kernels.build.end_point_overlap.Children."""
         raise InputError(f"a {self.name} has no end-point overlap, because it is not a hierarchy of boxes")
@@ -183,7 +222,7 @@ class OneMesh(TreeExchange, ABC):
     def epo(self) -> float:
         """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
-        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines (`wrt.accel.epo`).
+        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines.
 
         Returns
         -------
@@ -195,8 +234,6 @@ class OneMesh(TreeExchange, ABC):
         InputError
             If the structure is not a BVH.
         """
-        from wrt.accel.epo import end_point_overlap
-
         return end_point_overlap(self._children(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
-from wrt.accel.structure import NoOptions
+from wrt.accel.snapshot import Built
+from wrt.accel.structures import NoOptions
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import brute_force as kernels
 

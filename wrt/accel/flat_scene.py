@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 
 
 @dataclass(frozen=True, eq=False)

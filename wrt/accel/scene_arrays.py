@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, NumberedGeometry, inverse_of, spread_of
+from wrt.accel.geometry import MAX_SPREAD, Geometry, InstancedGeometry, NumberedGeometry, inverse_of, spread_of
 from wrt.accel.snapshot import Snapshot
 from wrt.core.errors import InputError
 

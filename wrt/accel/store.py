@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.flat_scene import FlatScene
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.scene_arrays import KINDS, arrays_of, scene_of
-from wrt.accel.snapshot import Snapshot
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Built, Snapshot, Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.checks import as_one

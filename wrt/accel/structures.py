@@ -1,13 +1,16 @@
-"""Table of acceleration structures: name -> module and class. Modules are imported on first use: `--help` does not wait for Warp."""
+"""Table of acceleration structures, name -> class, and their options. A lookup imports the class, so that `--help` waits for no Warp."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar, get_type_hints
 
 from wrt.core import settings
+from wrt.core.checks import accepts, did_you_mean, shown
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
+T = TypeVar("T")
 FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt.accel.base.OneMesh
 
 
@@ -43,3 +46,26 @@ ACCELERATORS = Structures("structure", {
 def stack_on(device: str) -> str:
     """Return where kernels on a device have their traversal stacks: a name in kernels.traverse.stack.PLACES."""
     return "local" if device == "cpu" else settings.stack  # a CPU has no other place
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Empty options, for a structure without options."""
+
+
+def options_of(name: str, options: type[T], values: dict[str, object]) -> T:
+    """Make the options of a structure. Raises InputError for unknown options, wrong types and values out of range."""
+    known, types = {field.name: field for field in fields(options)}, get_type_hints(options)  # type: ignore[arg-type]
+    for option, value in values.items():
+        if option not in known:
+            names = [*known, "triangle", "box"]
+            raise InputError(f"is no option of {name}",
+                             argument=option, hint=f"{did_you_mean(option, names)}there is {', '.join(names)}")
+        if not accepts(types[option], value):
+            raise InputError(f"must be {getattr(types[option], '__name__', types[option])}, got {shown(value)}", argument=option)
+    return options(**values)
+
+
+def default_options(name: str) -> dict[str, object]:
+    """Return the default value of each option of the structure called `name`."""
+    return {field.name: field.default for field in fields(ACCELERATORS[name].options)}

@@ -7,8 +7,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of, spread_of
+from wrt.accel.geometry import Geometry, InstancedGeometry, inverse_of, spread_of
 from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import empty_aligned, on_host, records, start, upload
 from wrt.kernels.traverse.bvh2 import Bvh2Node

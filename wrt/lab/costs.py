@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.observed import copied
-from wrt.accel.structure import WrappedStructure
+from wrt.accel.snapshot import WrappedStructure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all
 from wrt.core.types import Device, WarpArray, WarpType

@@ -15,7 +15,7 @@ import warp as wp
 
 from wrt.accel.queries.batches import new_scratch
 from wrt.accel.queries.raw_launches import Launches
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.core.device import launch_on, made_once, records, start, upload
 from wrt.core.threads import FreeList
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType

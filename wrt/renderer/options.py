@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wrt.accel.scenes.instancing import INSTANCING
-from wrt.accel.structure import check_units
+from wrt.accel.snapshot import check_units
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
 from wrt.core.device import start

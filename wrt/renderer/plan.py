@@ -8,7 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError

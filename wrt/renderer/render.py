@@ -11,12 +11,11 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.bvh.small import SMALL
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.accel.scenes.instancing import stored_meshes
-from wrt.accel.structure import default_options
+from wrt.accel.structures import default_options
 from wrt.core.checks import unknown
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning, warn

@@ -11,8 +11,8 @@ import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import Structure, default_options
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.snapshot import Structure
+from wrt.accel.structures import ACCELERATORS, default_options
 from wrt.kernels.query import HitArrays, RayArrays, load_ray
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units

@@ -13,7 +13,7 @@ from tests.rewalk import PRIMITIVE_BYTES, PRIMITIVES, REWALK, prim_ids, rays
 from tests.structures import STRUCTURES, families_first
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import make_closest_hit_kernel

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.kernel_tools import rounded, unit
 from tests.placed import place
 from tests.structures import families_first
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry, inverse_of
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry, inverse_of
 from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.scene.shapes import icosphere, torus

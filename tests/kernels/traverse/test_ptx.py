@@ -11,7 +11,7 @@ import pytest
 
 from tests import device
 
-from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel  # isort: skip (starts Warp)
+from wrt.accel.snapshot import Structure, any_hit_kernel, closest_hit_kernel  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.structures import ACCELERATORS

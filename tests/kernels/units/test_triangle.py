@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from tests.kernel_tools import DEVICE, directions, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.geometry import Geometry
+from wrt.accel.geometry import LAYOUTS, Geometry
 from wrt.accel.scenes.build import build
-from wrt.accel.triangle_data import LAYOUTS
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
 from wrt.kernels.units.box import box_ray
 from wrt.kernels.units.triangle import RAY_TRIANGLE, crossing, ray_triangle, sure_crossing, to_ray_space, triangle_ray, watertight

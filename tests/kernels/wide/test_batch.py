@@ -12,13 +12,12 @@ from tests.refused import refused
 from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.bvh.wide_tree import stack_need
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.batches import FEWEST, LEAST, MOST, SHARES, new_scratch, parts, tracer
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
+from wrt.accel.snapshot import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel

@@ -19,7 +19,7 @@ from wrt.accel.queries.rays import rays_of
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.query import RenderRays, make_render_rays_kernel
 from wrt.kernels.traverse.common import Units

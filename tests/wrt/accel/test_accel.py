@@ -21,8 +21,7 @@ from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build
-from wrt.accel.structure import NoOptions
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.structures import ACCELERATORS, NoOptions
 from wrt.core.device import records
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse.common import Units

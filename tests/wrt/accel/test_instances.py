@@ -24,7 +24,7 @@ from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
 from wrt.accel.scenes.flatten import flatten, flatten_joined
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import upload
 from wrt.kernels.query import RayArrays

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.placed import place
 from tests.refused import Refusal, refused
 from tests.wrt.accel.queries.test_threads import at_a_time
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
 from wrt.scene.materials import Material

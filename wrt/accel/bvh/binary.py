@@ -12,15 +12,14 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, BoxTree
-from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.device_geometry import DeviceGeometry
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import NumberedGeometry
+from wrt.accel.geometry import Geometry, NumberedGeometry
 from wrt.accel.queries.rays import vectors
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
@@ -178,7 +177,7 @@ class Bvh2(BinaryBvh):
         launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
 
     def _children(self, built: Built) -> WarpStruct:
-        from wrt.accel.epo import children
+        from wrt.accel.box_tree import children
 
         nodes = built.arrays["nodes"]
         lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1)

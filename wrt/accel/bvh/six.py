@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions
 from wrt.accel.bvh.compress import compress, decompress
 from wrt.accel.bvh.wide import CollapsedBvh
 from wrt.accel.bvh.wide_tree import WideTree, check_wide
+from wrt.accel.snapshot import Built
 from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import bvh6 as kernels

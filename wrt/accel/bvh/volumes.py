@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.bvh.binary import BinaryBvh
 from wrt.accel.bvh.kdop_area import kdop_areas
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_links
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.types import WarpType

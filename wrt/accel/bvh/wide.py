@@ -12,7 +12,6 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, INNER, BoxTree
-from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree, small_trees
@@ -20,6 +19,7 @@ from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.bvh.wide_tree import WideTree, check_wide, collapse, collapse_kernels, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.accel.snapshot import Built
 from wrt.core.building import report, report_parts
 from wrt.core.device import aligned, empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
@@ -119,7 +119,7 @@ class CollapsedBvh(OneMesh):
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _children(self, built: Built) -> WarpStruct:
-        from wrt.accel.epo import children
+        from wrt.accel.box_tree import children
 
         tree = self._tree(built)
         leaf = tree.children < 0

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.building import tally
 from wrt.core.device import launch, on_host, records, start, upload

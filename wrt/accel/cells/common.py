@@ -3,9 +3,9 @@
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.snapshot import Built
 from wrt.accel.store import row_type
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError

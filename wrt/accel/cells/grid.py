@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Built
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.types import WarpArray, WarpStruct

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
 from wrt.accel.cells.kdtree_build import KdOptions, build_tree
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import kdtree as kernels

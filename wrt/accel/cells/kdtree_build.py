@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Built
 from wrt.core.building import tally
 from wrt.core.checks import shown
 from wrt.core.device import launch, load_kernel, on_host, records, start, upload

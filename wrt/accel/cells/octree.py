@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
 from wrt.accel.cells.common import check_numbers, check_references, one_row
 from wrt.accel.cells.octree_build import OctreeOptions, build_tree
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import octree as kernels

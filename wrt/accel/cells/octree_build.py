@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
+from wrt.accel.snapshot import Built
 from wrt.core.building import report
 from wrt.core.device import launch, records, start, upload
 from wrt.core.types import WarpArray, WarpStruct

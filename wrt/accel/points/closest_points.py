@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.points.contains import contains
 from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of

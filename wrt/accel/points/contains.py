@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.points.enclosing import enclosing, finite_faces, open_edges
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery

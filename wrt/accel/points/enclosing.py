@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.snapshot import Snapshot, once
 from wrt.scene.clean import copies, flip_collinear, has_area, merged, windings

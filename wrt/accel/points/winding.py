@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
+from wrt.accel.geometry import InstancedGeometry, inverse_of
 from wrt.accel.points.contains import open_edges_of
 from wrt.accel.points.enclosing import enclosing
 from wrt.accel.points.winding_tree import winding_tree

@@ -9,10 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
-from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry, InstancedGeometry
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.gradients import record
@@ -21,8 +19,7 @@ from wrt.accel.queries.rays import are_rows, rays_of
 from wrt.accel.queries.shapes import flat_arrays, in_shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.tiles import tiled_width
 from wrt.accel.queries.world_ids import check_world
-from wrt.accel.snapshot import Snapshot
-from wrt.accel.structure import Structure, check_units
+from wrt.accel.snapshot import AccelStats, Snapshot, Structure, check_units
 from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import check_keywords, parameters_of, shown
 from wrt.core.device import start, upload

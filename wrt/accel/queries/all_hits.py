@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import Tracer, lister
@@ -21,8 +21,7 @@ from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
 from wrt.accel.queries.shapes import Shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.world_ids import WorldIds, check_world, roots_at
-from wrt.accel.snapshot import Snapshot
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Snapshot, Structure
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload

@@ -11,8 +11,7 @@ from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
 from wrt.accel.queries.world_ids import WorldIds
-from wrt.accel.snapshot import Snapshot
-from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
+from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of

@@ -10,8 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, run_of
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import rays_on, to_origin
 from wrt.accel.queries.shapes import in_shape

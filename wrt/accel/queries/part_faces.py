@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.device import upload
 from wrt.core.types import WarpArray

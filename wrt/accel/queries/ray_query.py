@@ -9,8 +9,7 @@ import warp as wp
 
 from wrt.accel.geometry import MESH_OF_A_SPHERE
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.snapshot import Snapshot
-from wrt.accel.structure import Structure, check_units
+from wrt.accel.snapshot import Snapshot, Structure, check_units
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_one
 from wrt.core.device import made_once

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays

@@ -6,7 +6,7 @@ from typing import TypeGuard
 import numpy as np
 import warp as wp
 
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.snapshot import Snapshot
 from wrt.core.arrays import real_numbers, to_numpy
 from wrt.core.checks import shown

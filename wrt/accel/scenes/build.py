@@ -16,12 +16,10 @@ from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
-from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.instances import Instances
-from wrt.accel.scenes.flatten import flatten
+from wrt.accel.scenes.flatten import flatten, worlds_over
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import from_tensor, is_tensor, to_numpy

@@ -40,7 +40,7 @@ def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
 
 def is_invertible(thing: Object) -> bool:
     """Return whether rays can be transformed to the object's own space without much loss of accuracy."""
-    from wrt.accel.instanced_geometry import MAX_SPREAD  # not at the top, because it imports Warp, which slows `render --help`
+    from wrt.accel.geometry import MAX_SPREAD  # not at the top, because it imports Warp, which slows `render --help`
 
     linear = thing.transform[:3, :3]
     with np.errstate(all="ignore"):

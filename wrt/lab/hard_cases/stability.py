@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.all_hits import all_hits
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
+from wrt.accel.snapshot import Built
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study, child_0_first

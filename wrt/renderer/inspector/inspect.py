@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 import warp as wp
 
-from wrt.accel.structure import WrappedStructure
+from wrt.accel.snapshot import WrappedStructure
 from wrt.core.checks import as_integer, as_tuple, shown, unknown
 from wrt.core.device import on_host, start
 from wrt.core.errors import InputError

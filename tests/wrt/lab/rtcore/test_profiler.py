@@ -15,7 +15,7 @@ import wrt
 from tests.kernel_tools import machine_code
 from tests.refused import refused
 from tests.rewalk import REWALK, rays
-from wrt.accel.structure import Structure
+from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.traverse.common import Units
 from wrt.lab.costs import COUNTERS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.built import Built
+from wrt.accel.snapshot import Built
 from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.kernels.traverse import runs as kernels
