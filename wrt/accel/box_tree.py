@@ -16,7 +16,6 @@ from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
 from wrt.core.files import require_file, write_bytes
 from wrt.core.types import PathLike, WarpStruct
-from wrt.kernels.build import end_point_overlap as kernels
 
 MOST_CHILDREN = 8
 TRIANGLES_PER_LAUNCH = 16384
@@ -272,6 +271,8 @@ def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> flo
     Volume Hierarchies", equation 2. It sums over all nodes: cost times the fraction of the surface that is in the node's box, but not in
     its subtree. Only finite triangles have surface. A triangle with several references is in several subtrees.
     """
+    from wrt.kernels.build import end_point_overlap as kernels  # not at the top, because a start does not need it
+
     cpu = start("cpu")
     n = len(geometry.faces)
     corners = geometry.vertices[geometry.faces].astype(np.float64)
@@ -288,6 +289,8 @@ def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> flo
 
 def children(lo: np.ndarray, hi: np.ndarray, first: np.ndarray, count: np.ndarray, order: np.ndarray) -> WarpStruct:
     """Make Children for end_point_overlap. lo, hi: (N, width, 3); first, count: (N, width); order: (R,) prim_ids of the leaves."""
+    from wrt.kernels.build import end_point_overlap as kernels
+
     cpu = start("cpu")
     tree = kernels.Children()
     tree.width = first.shape[1]

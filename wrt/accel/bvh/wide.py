@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.box_tree import ABSENT, INNER, BoxTree
+from wrt.accel.box_tree import ABSENT, INNER, BoxTree, children
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree, small_trees
@@ -119,8 +119,6 @@ class CollapsedBvh(OneMesh):
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _children(self, built: Built) -> WarpStruct:
-        from wrt.accel.box_tree import children
-
         tree = self._tree(built)
         leaf = tree.children < 0
         first = np.where(leaf, leaf_first.func(tree.children.astype(np.int64)) * self.width, tree.children)
