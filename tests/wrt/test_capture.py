@@ -139,7 +139,7 @@ AT_ONCE = {"__version__", *"""
     GradientBackground Camera FisheyeCamera OrthographicCamera PanoramaCamera DirectionalLight PointLight SpotLight Checkerboard Material
     Texture Mesh Object Scene Sphere Motion Settings LiveView side_by_side""".split()}
 AT_ONCE |= {f"{kind}.{name}" for kind, names in {
-    "OneMesh": "built build_all can_refit data from_tree geometry origin restore stats stream tree world",
+    "OneMesh": "built build_all can_refit data geometry origin restore stats stream tree world",
     "Instances": "data geometry name origin restore stats world",
     "Hits": "counters each in_shape shape source warp",
     "Sensor": "picture rays",

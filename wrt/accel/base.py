@@ -26,7 +26,7 @@ from wrt.core.building import build_clock, report_parts
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
+from wrt.core.types import ArrayLike, Device, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
@@ -62,26 +62,9 @@ class OneMesh(Accelerator, ABC):
     def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
         """Make a structure from saved arrays, or raise InputError if they do not fit. units: intersection tests; built_with: options."""
-        self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, units or Units()), geometry, attributes, device, threads)
-        self.built_with, begin = cls.options() if built_with is None else built_with, build_clock()
+        begin, built_with = build_clock(), cls.options() if built_with is None else built_with
+        self = unbuilt(cls, units or Units(), built_with, geometry, attributes, device, threads)
         check_order(built.order, len(geometry), cls.name)
-        self._check(built)
-        self._install(built, begin, built.sah_cost)
-        return self
-
-    @classmethod
-    def from_tree(cls, tree: BoxTree, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
-                  threads: int | None = None, *, spatial_splits: bool = False) -> Self:
-        """Make a structure from another builder's tree, as wrt.accel_from_tree does.
-
-        Raises InputError if the tree is not a tree over the geometry, or the structure cannot hold it.
-        """
-        self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, Units()), geometry, attributes, device, threads)
-        self.built_with = cls.options()
-        begin = build_clock()
-        built = self._built_of(tree.checked(geometry, spatial_splits))
         self._check(built)
         self._install(built, begin, built.sah_cost)
         return self
@@ -215,10 +198,6 @@ class OneMesh(Accelerator, ABC):
         """Convert a tree, whose boxes contain the padded primitives."""
         raise InputError(f"a {self.name} cannot be made from a tree of boxes", argument="accel", hint="use a BVH")
 
-    def _children(self, built: Built) -> WarpStruct:
-        """Convert a hierarchy of boxes to kernels.build.end_point_overlap.Children."""
-        raise InputError(f"a {self.name} has no end-point overlap, because it is not a hierarchy of boxes")
-
     def epo(self) -> float:
         """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
@@ -234,20 +213,10 @@ class OneMesh(Accelerator, ABC):
         InputError
             If the structure is not a BVH.
         """
-        return end_point_overlap(self._children(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
+        return end_point_overlap(self._box_tree(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
-        def on_device(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
-            return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
-
-        data = self.structure.struct()
-        types = fields_of(data)
-        for name, array in built.arrays.items():
-            kind = types[name]
-            is_array = isinstance(kind, wp.array)
-            setattr(data, name, on_device(array, kind.dtype) if is_array else kind(*np.ravel(array)))
-        data.primitives = on_device(self._primitives(built), types["primitives"].dtype)
-        return data
+        return uploaded(self.structure, built, self._primitives(built), self.device)
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
         """Return the records that the triangle test reads, in the order of `built.order`."""
@@ -275,20 +244,50 @@ class OneMesh(Accelerator, ABC):
                 f"{s.bytes / 1e6:.1f} MB, {f'SAH {s.sah_cost:.1f}, ' if s.sah_cost == s.sah_cost else ''}built in {s.build_seconds:.3f} s)")
 
 
+def uploaded(structure: Structure, built: Built, primitives: np.ndarray | WarpArray, device: Device) -> WarpStruct:
+    """Return the struct of a structure's arrays on a device. primitives: the records of the triangle test."""
+
+    def on_device(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
+        return array if isinstance(array, wp.array) else upload(array, dtype, device)
+
+    data = structure.struct()
+    types = fields_of(data)
+    for name, array in built.arrays.items():
+        kind = types[name]
+        setattr(data, name, on_device(array, kind.dtype) if isinstance(kind, wp.array) else kind(*np.ravel(array)))
+    data.primitives = on_device(primitives, types["primitives"].dtype)
+    return data
+
+
 def array_bytes(data: WarpStruct) -> int:
     """Return the size of all arrays in a Warp struct, in bytes."""
     arrays = (getattr(data, name) for name in fields_of(data))
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))
 
 
+def unbuilt(kind: type[MeshT], units: Units, built_with: object, geometry: Geometry, attributes: FlatScene | None, device: str,
+            threads: int | None) -> MeshT:
+    """Make a structure without its tree. built_with: options of the class."""
+    out = kind.__new__(kind)
+    Accelerator.__init__(out, Structure(kind, units), geometry, attributes, device, threads)
+    out.__dict__.update(built_with=built_with)
+    return out
+
+
+def from_tree(kind: type[MeshT], tree: BoxTree, geometry: Geometry, attributes: FlatScene | None, device: str, threads: int | None,
+              spatial_splits: bool) -> MeshT:
+    """Make a structure from another builder's tree (wrt.accel_from_tree). Raises InputError if it is no tree over the geometry."""
+    options = kind.options()
+    empty = unbuilt(kind, Units(), options, geometry, attributes, device, threads)
+    built = empty._built_of(tree.checked(geometry, spatial_splits))
+    return kind.restore(built, geometry, attributes, device, threads, built_with=options)
+
+
 def build_each(kind: type[MeshT], geometries: Sequence[Geometry], device: str, threads: int | None, units: Units,
                options: dict[str, object]) -> list[MeshT]:
     """Build a structure over each geometry, all with the same options. AccelStats.build_seconds is the time of all of them."""
     begin, built_with = build_clock(), options_of(kind.name, kind.options, options)
-    structures = [kind.__new__(kind) for _ in geometries]
-    for each, geometry in zip(structures, geometries, strict=True):
-        Accelerator.__init__(each, Structure(kind, units), geometry, None, device, threads)
-        each.__dict__.update(built_with=built_with)
+    structures = [unbuilt(kind, units, built_with, geometry, None, device, threads) for geometry in geometries]
     built = kind.build_all(structures, built_with) if kind.build_all else report_parts(structures, lambda each: each._build(built_with))
     for each, arrays in zip(structures, built, strict=True):
         each._install(arrays, begin, arrays.sah_cost)

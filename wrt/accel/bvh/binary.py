@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.box_tree import ABSENT, BoxTree, children
+from wrt.accel.box_tree import ABSENT, BoxTree
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
@@ -175,9 +175,3 @@ class Bvh2(BinaryBvh):
 
     def _write_corners(self, shape: WarpStruct, order: WarpArray, out: WarpArray) -> None:
         launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
-
-    def _children(self, built: Built) -> WarpStruct:
-        nodes = built.arrays["nodes"]
-        lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1)
-                                for part in ("lo", "hi", "first", "count"))
-        return children(lo, hi, first, np.where(lo[..., 0] > hi[..., 0], -1, count), built.order)

@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.box_tree import ABSENT, INNER, BoxTree, children
+from wrt.accel.box_tree import ABSENT, INNER, BoxTree
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree, small_trees
@@ -117,14 +117,6 @@ class CollapsedBvh(OneMesh):
         tree = refit(self._tree(built), self.geometry)
         built = replace(built, arrays=self._arrays(tree))
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
-
-    def _children(self, built: Built) -> WarpStruct:
-        tree = self._tree(built)
-        leaf = tree.children < 0
-        first = np.where(leaf, leaf_first.func(tree.children.astype(np.int64)) * self.width, tree.children)
-        count = np.where(leaf, leaf_count.func(tree.children), np.where(tree.children == EMPTY, -1, 0))
-        return children(tree.lo, tree.hi, first, count, tree.order)
-
 
 class WideBvh(CollapsedBvh):
     """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, U
 
 import warp as wp
 
-from wrt.accel.base import OneMesh
+from wrt.accel.base import OneMesh, from_tree
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
@@ -258,9 +258,7 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
         raise InputError("must not be a scene with instances", argument="mesh")
     name = accel or ("bvh2" if read.width <= 2 else "bvh4" if read.width <= 4 else "bvh8")
     ACCELERATORS.check(as_one(name, str, "accel"), "accel")
-    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, device_of(mesh, device), threads,
-                                                spatial_splits=spatial_splits)
-    return out
+    return from_tree(ACCELERATORS[name], read, flat.geometry, flat, device_of(mesh, device), threads, spatial_splits)
 
 
 def device_of(mesh: Any, device: str | None) -> str:
