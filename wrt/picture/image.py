@@ -22,8 +22,7 @@ from wrt.core.files import read_file, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8
-from wrt.picture.radiance import read_hdr
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, read_hdr
 from wrt.picture.tonemap import REC_709, decode_srgb, to_codes, to_rec_709
 
 Metadata = Mapping[str, object]
@@ -143,18 +142,14 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
     """Write (H, W, C) float32 by OpenImageIO, and insert `header` after the first line of the file."""
     oiio = _oiio()
     with replacing(path) as file:
-        # By the name of the descriptor, if possible: another user of the folder could replace the file by a link.
-        name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
-        out = oiio.ImageOutput.create(os.path.basename(file.name))  # OpenImageIO rejects folders that are not UTF-8
-        if out is None:
-            raise InputError(f"cannot be written: {oiio.geterror()}", path=path)
+        out = oiio.ImageOutput.create(Path(path).suffix[1:])
         try:
-            good = out.open(name, spec) and out.write_image(pixels)
-        finally:
-            closed = out.close()
+            good = out is not None and out.open(file.name, spec) and out.write_image(pixels) and out.close()
+        except TypeError:
+            raise InputError("cannot be written: OpenImageIO needs a path in UTF-8", path=path) from None
         # OpenImageIO reports some failures, such as a full disk, by geterror alone.
-        error = " ".join(out.geterror().split()).replace(name, os.fspath(path))
-        if error or not (good and closed):
+        error = " ".join((oiio if out is None else out).geterror().split()).replace(file.name, os.fspath(path))
+        if error or not good:
             raise InputError(f"cannot be written: {error or 'unknown error'}", path=path)
         if header:
             file.seek(0)

@@ -1,8 +1,8 @@
 """What is at a clicked pixel: the surface there, the rays of the inspector, and the walk of its camera ray, as messages for the page."""
 
 import io
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -115,23 +115,8 @@ def project(camera: Camera | OrthographicCamera, size: tuple[int, int], ends: np
     return np.stack([0.5 + 0.5 * x, 0.5 - 0.5 * y], axis=-1)
 
 
-class Step(Protocol):
-    """A step of a walk, as wrt.lab.walk.record.WalkStep."""
-
-    @property
-    def text(self) -> str: ...
-
-
-class Walk(Protocol):
-    """A walk, as wrt.lab.walk.walk.Walk."""
-
-    @property
-    def steps(self) -> Sequence[Step]: ...
-
-    def draw(self, axes: Any, step: int) -> object: ...
-
-
-WalkOf = Callable[[Any, np.ndarray, np.ndarray], Walk]  # (structure, origin, direction), such as wrt.walk
+# (structure, origin, direction) to an object with `steps`, which have a text each, and `draw(axes, step)`, such as wrt.walk.
+WalkOf = Callable[[Any, np.ndarray, np.ndarray], Any]
 
 
 class Walks:
@@ -140,7 +125,7 @@ class Walks:
     def __init__(self, walk_of: WalkOf | None) -> None:
         self.walk_of = walk_of
         self._ray: tuple[Any, np.ndarray, np.ndarray] | None = None  # structure, origin, direction
-        self._walk: Walk | None = None
+        self._walk: Any = None
 
     def aim(self, prepared: Prepared, view: View, x: float, y: float) -> None:
         """Choose the ray through a point of the picture, 0 to 1 from the top left corner."""

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import errno
 import io
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +15,7 @@ from PIL import Image
 from tests.command_line import largest_file
 from tests.picture_metadata import read_metadata
 from tests.refused import Refusal, refused
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import SceneWarning
 from wrt.picture.decode import decode_rgba8
 from wrt.picture.image import EXACT_IN_FLOAT, FORMATS, check_writable, encode_png, read_channels, read_image, write_exr, write_image
 from wrt.picture.tonemap import decode_srgb, to_codes
@@ -90,11 +88,6 @@ def test_png_of_nonfinite_pixels_is_clipped_and_counted(pixels: np.ndarray, tmp_
     assert decode_rgba8((tmp_path / "a.png").read_bytes())[0, :3, 0].tolist() == [0, 255, 0]
 
 
-def test_codes_of_a_wrong_type_are_refused() -> None:
-    with pytest.raises(ValueError, match="uint8 or uint16"):
-        encode_png(np.zeros((2, 2, 3)))
-
-
 # --- EXR --------------------------------------------------------------------------------------------------------------
 
 
@@ -106,15 +99,6 @@ def test_exr_is_exact_and_mitsuba_agrees(pixels: np.ndarray, tmp_path: Path) -> 
     assert np.array_equal(read_image(path), pixels, equal_nan=True)
     assert np.array_equal(mitsuba_bitmap(path), pixels, equal_nan=True)
     assert read_metadata(path) == {key: str(value) for key, value in METADATA.items()}
-
-
-@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that takes any name")
-@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
-def test_a_name_that_openimageio_cannot_open_is_reported(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
-    path = tmp_path / os.fsdecode(b"b\xff" + suffix.encode())
-    write_image(path, pixels)
-    with refused(what="needs a path"):
-        read_image(path)
 
 
 def test_half_exr_is_rounded_to_half(pixels: np.ndarray, tmp_path: Path) -> None:
@@ -157,15 +141,6 @@ def test_exr_warns_of_integers_that_a_float_rounds(tmp_path: Path) -> None:
         write_exr(tmp_path / "a.exr", {"prim_id": ids})
 
 
-def test_exr_without_colours(tmp_path: Path) -> None:
-    grey = np.random.default_rng(0).random((H, W)).astype(np.float32)
-    write_exr(tmp_path / "grey.exr", {"Y": grey})
-    assert np.array_equal(read_image(tmp_path / "grey.exr"), np.repeat(grey[..., None], 3, axis=-1))
-    write_exr(tmp_path / "normal.exr", {"normal.X": grey, "normal.Y": grey, "normal.Z": grey})
-    with refused(what="channels R, G and B", path="normal.exr"):
-        read_image(tmp_path / "normal.exr")
-
-
 # --- HDR --------------------------------------------------------------------------------------------------------------
 
 
@@ -185,12 +160,6 @@ def test_hdr_replaces_what_it_cannot_hold_and_counts_it(pixels: np.ndarray, tmp_
     back = read_image(tmp_path / "a.hdr")
     assert back[0, 0].max() == back[0, 2].max() == 0.0
     assert back[0, 1].min() > 1e37
-
-
-def test_metadata_cannot_break_the_hdr_header(pixels: np.ndarray, tmp_path: Path) -> None:
-    write_image(tmp_path / "a.hdr", pixels, metadata={"scene": "two\n\nlines"})
-    assert read_image(tmp_path / "a.hdr").shape == pixels.shape
-    assert read_metadata(tmp_path / "a.hdr") == {"scene": "two lines"}
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [(".jpg", "JPEG"), (".JPEG", "JPEG"), (".webp", "WEBP")])
@@ -221,23 +190,6 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(suffix: str, tmp_path:
     with largest_file(10_000), refused(None, "cannot be written", path=path) as caught:
         write_image(path, noise)
     assert not re.search("[0-9a-f]{32}", str(caught.value))  # the temporary name is nobody's business
-    assert path.read_bytes() == b"old"
-    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
-
-
-@EACH_SUFFIX
-@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-def test_a_failing_rename_leaves_the_old_file_and_nothing_else(
-    suffix: str, error: type[BaseException], pixels: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise error(errno.EIO, "Input/output error")
-
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(b"old")
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(InputError if error is OSError else KeyboardInterrupt):
-        write_image(path, pixels)
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
@@ -283,14 +235,6 @@ def test_unusable_outputs_are_refused(
         with refused(*message):
             use(tmp_path / name)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.png"]
-
-
-def test_a_write_protected_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.png").write_bytes(b"old")
-    (tmp_path / "a.png").chmod(0o444)
-    monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.W_OK and str(path).endswith("a.png")))
-    with refused(what="write-protected"):
-        check_writable(tmp_path / "a.png")
 
 
 def test_pixels_of_a_wrong_shape_are_refused(tmp_path: Path) -> None:
@@ -391,5 +335,5 @@ def test_unknown_suffixes_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["png", "exr", "hdr"])
 def test_metadata_may_hold_what_cannot_be_encoded(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a.{suffix}"
-    write_image(path, np.ones((2, 2, 3)), metadata={"scene": "a\udcffö"})
-    assert read_metadata(path)["scene"] == "a?ö"
+    write_image(path, np.ones((2, 2, 3)), metadata={"scene": "a\udcffö\n\n"})
+    assert read_metadata(path)["scene"].strip() == "a?ö" and read_image(path).shape == (2, 2, 3)
