@@ -8,13 +8,14 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from wrt.core.interrupts import held_interrupts
-from wrt.core.threads import submit
+from wrt.core.threads import submit, with_stack
 from wrt.core.types import Device
 from wrt.core.version import VERSION
 from wrt.picture.film import Film
@@ -68,6 +69,15 @@ class LocalTracer:
         if self.device.is_cuda:
             done = sum(trace(job) for job in work)
             wp.synchronize_device(self.device)
+            yield done, True
+            return
+        if min(self.prepared.threads, len(work)) == 1:  # the calling thread: another thread would cost 5 % of a small picture
+            done, next_step = 0, time.monotonic() + STEP_SECONDS
+            for job in work:
+                done += with_stack(partial(trace, job))
+                if time.monotonic() >= next_step or due():
+                    yield done, True
+                    next_step = time.monotonic() + STEP_SECONDS
             yield done, True
             return
         left, samples = deque(work), list[int]()  # a future for each job would add 10 % to a short picture
