@@ -31,7 +31,7 @@ COMMANDS: Registry[click.Command] = Registry("command", {
     "build": "wrt.cli.build:build",
     "compare": "wrt.cli.compare:compare",
     "compile": "wrt.cli.compile:compile_kernels",
-    "devices": "wrt.cli.devices:devices",
+    "devices": "wrt.cli.measure:devices",
     "info": "wrt.cli.scene_files:info",
     "inspect": "wrt.cli.inspect:inspect",
     "profile": "wrt.cli.measure:profile",

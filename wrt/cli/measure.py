@@ -1,4 +1,4 @@
-"""The commands that measure: `bench` with its subcommands, `stability`, `profile`, `whatif`."""
+"""The commands that measure: `bench` with its subcommands, `stability`, `profile`, `whatif`; and `devices`."""
 
 import tempfile
 from dataclasses import replace
@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import SIZE, Assignments, Commands, Parsed, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Assignments, Commands, Parsed, load, naming, say, say_json, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
+from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 from wrt.lab.bench import Error, Pictures, Queries, Visibility
 from wrt.lab.claims import Claims
@@ -124,3 +125,38 @@ def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments
     text = equal_error.text(result)
     how.write(text)
     how.end(text, {**result.as_dict(), "output": how.output})
+
+
+@click.command()
+@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit; exit code 1 if a bit differs. Compiling"
+                                            " all kernels takes minutes")
+@click.option("--device", help="Device for --check: cuda:0 ...  [default: cuda:0; without a GPU: cpu]")
+@click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
+              help="Scene file for --check; repeatable  [default: the scenes of wrt]")
+@click.option("--rays", type=int, help="Number of rays for --check, per kind of ray, mesh and structure  [default: 20000]")
+@shared("quiet", "as_json")
+def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool, as_json: bool) -> None:
+    """List the devices, or compare one with the CPU."""
+    from wrt.core.device import describe_devices
+
+    if not check:
+        if scenes or rays is not None or device is not None:
+            raise InputError("need --check", argument="--device, --scene and --rays")
+        lines = describe_devices()
+        if as_json:
+            say_json({"devices": lines})
+        else:
+            click.echo("\n".join(lines))
+        return
+    from wrt.lab.device_check import run, text
+
+    without_a_gpu = not any(line.startswith("cuda:0") for line in describe_devices())
+    with warnings_reported(quiet):
+        result = run(device or ("cpu" if without_a_gpu else "cuda:0"), scenes, 20_000 if rays is None else rays,
+                     (lambda line: None) if quiet else say)
+    if as_json:
+        say_json(result.as_dict())
+    else:
+        click.echo(text(result))
+    if result.differ:
+        raise SystemExit(1)

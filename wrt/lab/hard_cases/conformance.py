@@ -149,12 +149,6 @@ def case_names(cases: str | Sequence[str] = ()) -> list[str]:
     return [name for name in chosen(cases or list(HARD_CASES)) if name not in EXCLUDED_CASES]
 
 
-def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
-    """Yield the results of `hard_cases` one by one."""
-    for name in case_names(cases):
-        yield Case(name, rays, seed).result(closest_hit)
-
-
 def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
     """Test a ray library on the hard cases: count rays that are lost, invented or have a wrong triangle.
 
@@ -179,7 +173,7 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
     ------
     InputError
         An unknown name, a case that needs spheres or t_min, or closest_hit returns arrays of other shape or type."""
-    return Report(tuple(results(closest_hit, cases, rays, seed)))
+    return Report(tuple(Case(name, rays, seed).result(closest_hit) for name in case_names(cases)))
 
 
 def _checked(answer: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
