@@ -17,8 +17,8 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
-from wrt.accel.snapshot import check_units, options_of
-from wrt.accel.structures import ACCELERATORS
+from wrt.accel.snapshot import check_units
+from wrt.accel.structures import ACCELERATORS, options_of
 from wrt.core.checks import as_choice, require_known
 from wrt.core.device import load_kernel, start
 from wrt.core.errors import InputError
