@@ -117,12 +117,8 @@ class OneMesh(Accelerator, ABC):
         raise NotImplementedError
 
     def _moved(self, vertices: ArrayLike) -> Geometry:
-        """Return the geometry with new vertices. Raises InputError for another shape and for values that are not finite."""
-        near, origin = near_zero(real_numbers(vertices, "vertices", "(V, 3)"))
-        if (moved := vectors(near, "vertices").copy()).shape != (self.geometry.n_vertices, 3):
-            raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
-        warn_if_far(moved, "refit", origin)
-        return Geometry(moved, self.geometry.faces, self.geometry.spheres, origin)
+        """Return the geometry with new vertices, or raise InputError."""
+        return moved_to(self.geometry, vertices)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
         raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh2")
@@ -201,12 +197,8 @@ class OneMesh(Accelerator, ABC):
     def epo(self) -> float:
         """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
-        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines.
-
-        Returns
-        -------
-        float
-            Overlap, at cost 1 per node and 1 per primitive.
+        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines. A node and a primitive
+        cost 1 each.
 
         Raises
         ------
@@ -242,6 +234,16 @@ class OneMesh(Accelerator, ABC):
         s = self.stats
         return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
                 f"{s.bytes / 1e6:.1f} MB, {f'SAH {s.sah_cost:.1f}, ' if s.sah_cost == s.sah_cost else ''}built in {s.build_seconds:.3f} s)")
+
+
+def moved_to(geometry: Geometry, vertices: ArrayLike) -> Geometry:
+    """Return a geometry with new vertices. Raises InputError for another shape and for values that are not finite."""
+    near, origin = near_zero(real_numbers(vertices, "vertices", "(V, 3)"))
+    moved, shape = vectors(near, "vertices").copy(), (geometry.n_vertices, 3)
+    if moved.shape != shape:
+        raise InputError(f"must be {shape}, got {moved.shape}", argument="vertices")
+    warn_if_far(moved, "refit", origin)
+    return Geometry(moved, geometry.faces, geometry.spheres, origin)
 
 
 def uploaded(structure: Structure, built: Built, primitives: np.ndarray | WarpArray, device: Device) -> WarpStruct:
