@@ -4,7 +4,7 @@ does not depend on the number of threads."""
 
 import warp as wp
 
-from wrt.kernels.build.triangle_cell import CellSource, TriangleCell, meets_cell, triangle_cell
+from wrt.kernels.build.clip import Shapes, TriangleCell, meets_cell, triangle_cell
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane, slab_of
 
@@ -25,21 +25,20 @@ def slab_lo(layout: GridLayout, x: int, y: int, z: int) -> wp.vec3:
 
 
 @kernel
-def list_cells(source: CellSource, layout: GridLayout, first: int, begin: wp.array(dtype=wp.int64), count: wp.array(dtype=wp.int32),
+def list_cells(shapes: Shapes, layout: GridLayout, first: int, begin: wp.array(dtype=wp.int64), count: wp.array(dtype=wp.int32),
                cells: wp.array(dtype=wp.int32)):
     """Write the indices of the cells that primitive i = first + tid meets to `cells`, from begin[i] on. If `cells` is empty, only count the
     cells, in count[i]."""
     i = first + wp.tid()
-    lo = source.lo[i]
-    hi = source.hi[i]
+    lo = shapes.lo[i]
+    hi = shapes.hi[i]
     x = slabs_of(layout, lo, hi, 0)
     y = slabs_of(layout, lo, hi, 1)
     z = slabs_of(layout, lo, hi, 2)
-    exact = i < source.faces.shape[0] and (x[0] != x[1] or y[0] != y[1] or z[0] != z[1])
+    exact = i < shapes.faces.shape[0] and (x[0] != x[1] or y[0] != y[1] or z[0] != z[1])
     triangle = TriangleCell()
     if exact:
-        face = source.faces[i]
-        triangle = triangle_cell(source.vertices[face[0]], source.vertices[face[1]], source.vertices[face[2]], lo, hi)
+        triangle = triangle_cell(shapes, i)
     writes = cells.shape[0] > 0
     n = int(0)
     for k in range(z[0], z[1] + 1):

@@ -35,11 +35,11 @@ ACCELERATORS = Structures("structure", {
     "bvh2_sphere": "wrt.accel.bvh.volumes:Bvh2Sphere",
     "bvh2_kdop": "wrt.accel.bvh.volumes:Bvh2Kdop",
     "bvh8c": "wrt.accel.bvh.wide:Bvh8c",
-    "kdtree": "wrt.accel.cells.kdtree:KdTree",
-    "bsp": "wrt.accel.cells.bsp:Bsp",
+    "kdtree": "wrt.accel.cells.trees:KdTree",
+    "bsp": "wrt.accel.cells.trees:Bsp",
     "brute_force": "wrt.accel.brute_force:BruteForce",
     "grid": "wrt.accel.cells.grid:Grid",
-    "octree": "wrt.accel.cells.octree:Octree",
+    "octree": "wrt.accel.cells.trees:Octree",
 }, "wrt.structures", type)
 
 

@@ -1,4 +1,11 @@
-"""Shared code of the grid, octree, k-d tree and BSP tree: input of the builders, and checks of files."""
+"""Shared code of the grid, octree, k-d tree and BSP tree: the builder of the trees, and checks of options and files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -7,21 +14,138 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Built
 from wrt.accel.store import row_type
-from wrt.core.device import start, upload
+from wrt.core.building import tally
+from wrt.core.device import launch, load_kernel, on_host, records, start, upload
 from wrt.core.errors import InputError
-from wrt.core.types import WarpStruct
-from wrt.kernels.build.triangle_cell import CellSource
-from wrt.kernels.units.box import PAD_EXTENT
+from wrt.core.threads import run_all
+from wrt.core.types import Kernel, WarpStruct
+from wrt.kernels.build import cells as kernels
+from wrt.kernels.build.cell_splits import RULES
+from wrt.kernels.build.clip import Shapes
+from wrt.kernels.build.records import BuildRecord
+from wrt.kernels.traverse.planes import LEAF, BspNode
+from wrt.kernels.units.box import half_area
 from wrt.kernels.warp_private import fields_of
 
+# Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.
+CLIP_SIZES = (1e-30, 1e30)
+MAX_REFERENCES = 1 << 27
+KEEP = 4096  # A cell with so many references or fewer may be built by a launch of its own; in large trees: n / 64.
 
-def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> WarpStruct:
-    """Upload the triangles, and the padded boxes `bounds` of all primitives, as kernels.build.triangle_cell.CellSource."""
-    cpu, source = start("cpu"), CellSource()
-    source.vertices = upload(geometry.vertices, wp.vec3, cpu)
-    source.faces = upload(geometry.faces, wp.vec3i, cpu)
-    source.lo, source.hi = (upload(array, wp.vec3, cpu) for array in bounds)
-    return source
+
+def bounds_of(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the padded boxes of all primitives, each with a volume."""
+    lo, hi = geometry.bounds()
+    return lo, np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))
+
+
+def longest_side(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Return the longest side of all boxes, float32."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.nextafter((hi - lo).max(initial=0.0), np.float32(np.inf)))
+
+
+def shapes_of(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], clip: bool = True) -> WarpStruct:
+    """Upload the primitives as kernels.build.clip.Shapes. bounds: their padded boxes. clip: False to clip boxes, not triangles."""
+    cpu, shapes = start("cpu"), Shapes()
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = (bounds[1] - bounds[0]).max(axis=1, initial=0.0)
+    exact = (extent > CLIP_SIZES[0]) & (extent < CLIP_SIZES[1]) & (np.arange(len(extent)) < len(geometry.faces)) & clip
+    shapes.vertices = upload(geometry.vertices, wp.vec3, cpu)
+    shapes.faces = upload(geometry.faces, wp.vec3i, cpu)
+    shapes.lo, shapes.hi = (upload(array, wp.vec3, cpu) for array in bounds)
+    shapes.exact = upload(exact.astype(np.uint8), wp.uint8, cpu)
+    return shapes
+
+
+@cache
+def build_kernel(name: str) -> Kernel:
+    kernel: Kernel = kernels.make_build_cells(RULES[name])
+    return kernel
+
+
+@dataclass
+class Subtree:
+    """Output of a launch: nodes, prim_ids of the leaves, totals, and cells for later launches with their references."""
+
+    nodes: np.ndarray
+    order: np.ndarray
+    totals: np.ndarray
+    deferred: np.ndarray = field(default_factory=lambda: records(kernels.Cell, 0))
+    references: np.ndarray = field(default_factory=lambda: records(BuildRecord, 0))
+
+
+@dataclass
+class Tree:
+    """A finished tree: BspNode records, the root first, and the prim_ids of the leaves. cost: SAH cost of a line through the root box."""
+
+    nodes: np.ndarray
+    order: np.ndarray
+    leaves: int
+    depth: int
+    cost: float
+
+    def built(self, arrays: dict[str, Any], order: np.ndarray | None = None) -> Built:
+        """Return the result of a builder. order: None for the primitives of the leaves."""
+        return Built(arrays, self.order if order is None else order, len(self.nodes) - self.leaves, self.leaves, self.depth, self.cost)
+
+
+def build_tree(name: str, shapes: WarpStruct, root: np.ndarray, options: WarpStruct, threads: int) -> Tree:
+    """Build the tree `name` of RULES. It does not depend on `threads`. root: a kernels.build.cells.Cell, (1,)."""
+    references = records(BuildRecord, root["count"][0])
+    references["lo"], references["hi"], references["prim_id"] = shapes.lo.numpy(), shapes.hi.numpy(), np.arange(len(references))
+    keep = max(len(references) // 64, KEEP)
+    options.keep = keep if len(references) > keep else 0
+    top = launched(name, shapes, references, root, options)
+    options.keep = 0
+    subtrees: list[Any] = [None] * len(top.deferred)
+    finished = tally(len(references) + int(top.deferred["count"].sum()))
+    finished(len(references))
+
+    def job(i: int) -> None:
+        cell = top.deferred[i : i + 1].copy()
+        part = top.references[cell["first"][0] :][: cell["count"][0]]
+        cell["first"] = cell["slot"] = 0
+        subtrees[i] = launched(name, shapes, part, cell, options)
+        finished(len(part))
+
+    # The largest cells come first, so that all threads end at about the same time.
+    run_all([partial(job, int(i)) for i in np.argsort(-top.deferred["count"], kind="stable")], threads)
+    return joined([top, *subtrees], float(half_area.func((root["hi"][0] - root["lo"][0].astype(np.float64)))))
+
+
+def launched(name: str, shapes: WarpStruct, references: np.ndarray, cell: np.ndarray, options: WarpStruct) -> Subtree:
+    """Build the subtree of a cell in one launch. The allocated memory is an upper bound; most of it is never touched."""
+    cpu, work, out = start("cpu"), kernels.CellWork(), kernels.CellOutput()
+    n, budget = len(references), int(cell["budget"][0])
+    work.references, work.parts = (wp.empty(budget, dtype=BuildRecord, device=cpu) for _ in range(2))
+    work.sides = wp.empty(budget, dtype=wp.uint8, device=cpu)
+    work.lows, work.highs = (wp.empty(n, dtype=wp.float32, device=cpu) for _ in range(2))
+    out.nodes = wp.empty(2 * budget + 64, dtype=BspNode, device=cpu)
+    out.order = wp.empty(budget, dtype=wp.int32, device=cpu)
+    out.deferred = wp.empty(8 * budget // options.keep + 64 if options.keep else 0, dtype=kernels.Cell, device=cpu)
+    out.records = wp.empty(budget if options.keep else 0, dtype=BuildRecord, device=cpu)
+    out.totals = wp.zeros(1, dtype=kernels.CellTotals, device=cpu)
+    launch(build_kernel(name), 1, shapes, upload(references, BuildRecord, cpu), upload(cell, kernels.Cell, cpu), options, work, out)
+    totals = on_host(out.totals)[0].copy()
+    return Subtree(on_host(out.nodes)[: totals["nodes"]].copy(), out.order.numpy()[: totals["references"]].copy(), totals,
+                   on_host(out.deferred)[: totals["deferred"]].copy(), on_host(out.records)[: totals["records"]].copy())
+
+
+def joined(parts: list[Subtree], area: float) -> Tree:
+    """Join the top and the subtrees of its deferred cells, whose roots replace their nodes. area: half surface area of the root box."""
+    top, nodes = parts[0], [parts[0].nodes]
+    first_node, first_reference = len(top.nodes), len(top.order)
+    for part, slot in zip(parts[1:], top.deferred["slot"], strict=True):
+        part.nodes["first"] += np.where(part.nodes["axis"] == LEAF, first_reference, first_node - 1).astype(np.int32)
+        top.nodes[slot] = part.nodes[0]
+        nodes.append(part.nodes[1:])
+        first_node += len(part.nodes) - 1
+        first_reference += len(part.order)
+    totals = np.array([part.totals for part in parts])
+    cost = float(totals["cost"].sum()) / area if area > 0.0 else float("nan")
+    return Tree(np.concatenate(nodes), np.concatenate([part.order for part in parts]), int(totals["leaves"].sum()),
+                int(totals["depth"].max()), cost)
 
 
 def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
@@ -29,14 +153,10 @@ def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
     arrays = dict(built.arrays)
     for name, kind in fields_of(accel.structure.struct()).items():
         if name in arrays and not isinstance(kind, wp.array):
+            if np.size(arrays[name]) != math.prod(row_type(kind).shape):
+                raise InputError(f"is damaged: {name} has a wrong size")
             arrays[name] = np.reshape(arrays[name], row_type(kind).shape)
     return arrays
-
-
-def check_numbers(arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError unless pad and extent are valid for kernels.traverse.cell_ray.cell_slack, and mailbox is 0 or 1."""
-    if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
-        raise InputError("is damaged: pad, extent or mailbox is out of range")
 
 
 def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:
@@ -53,15 +173,3 @@ def require_between(**options: tuple[float, float, float]) -> None:
     for name, (value, low, high) in options.items():
         if not low <= value <= high:
             raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)
-
-
-def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an upper bound of the padding, and the largest extent, of triangles' boxes (for kernels.traverse.cell_ray.cell_slack)."""
-    n = len(geometry.faces)
-    if not n:
-        return np.zeros((), np.float32), np.zeros((), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        extent = (hi[:n] - lo[:n]).max()
-        # The pad of a box is at most this fraction of its extent and its coordinates (Geometry.bounds).
-        pad = np.float32(PAD_EXTENT) * (extent + np.maximum(np.abs(lo[:n]), np.abs(hi[:n])).max())
-    return np.asarray(pad), np.asarray(extent)

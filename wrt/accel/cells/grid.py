@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.bvh.tree import half_areas
-from wrt.accel.cells.common import cell_source, check_numbers, check_references, one_row, require_between, triangle_reach
+from wrt.accel.cells.common import check_references, one_row, require_between, shapes_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built
 from wrt.core.device import launch, on_host, records, start, upload
@@ -64,7 +64,8 @@ class Grid(OneMesh):
 
     def _check(self, built: Built) -> None:
         arrays = one_row(self, built)
-        check_numbers(arrays)
+        if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
+            raise InputError("is damaged: pad, extent or mailbox is out of range")
         lo, hi, size, n = (arrays[name] for name in ("lo", "hi", "size", "n"))
         with np.errstate(over="ignore", invalid="ignore"):
             last = lo + (n - 1).astype(np.float32) * size
@@ -129,12 +130,12 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
                     threads: int) -> tuple[np.ndarray, np.ndarray]:
     """Return GridCell records, and the prim_ids of all cells one after another, (R,) int32."""
     cpu = start("cpu")
-    source = cell_source(geometry, bounds)
+    shapes = shapes_of(geometry, bounds)
     n = len(geometry)
     count = wp.zeros(n, dtype=wp.int32, device=cpu)
 
     def run(begin: WarpArray, cells: WarpArray) -> None:
-        launch(build_grid.list_cells, n, source, layout, None, begin, count, cells, threads=threads, step=PRIMITIVES_PER_LAUNCH)
+        launch(build_grid.list_cells, n, shapes, layout, None, begin, count, cells, threads=threads, step=PRIMITIVES_PER_LAUNCH)
 
     run(wp.zeros(0, dtype=wp.int64, device=cpu), wp.zeros(0, dtype=wp.int32, device=cpu))
     begin = np.zeros(n + 1, np.int64)
@@ -151,6 +152,18 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     references = wp.zeros(total, dtype=wp.int32, device=cpu)
     launch(build_grid.sort_by_cell, 1, device_begin, cell_of, cells, references)
     return on_host(cells), references.numpy()
+
+
+def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an upper bound of the padding, and the largest extent, of triangles' boxes (for kernels.traverse.grid.cell_slack)."""
+    n = len(geometry.faces)
+    if not n:
+        return np.zeros((), np.float32), np.zeros((), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = (hi[:n] - lo[:n]).max()
+        # The pad of a box is at most this fraction of its extent and its coordinates (Geometry.bounds).
+        pad = np.float32(PAD_EXTENT) * (extent + np.maximum(np.abs(lo[:n]), np.abs(hi[:n])).max())
+    return np.asarray(pad), np.asarray(extent)
 
 
 def sah_cost(layout: WarpStruct, total: int) -> float:

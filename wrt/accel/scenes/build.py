@@ -44,10 +44,8 @@ if TYPE_CHECKING:
     from wrt.accel.bvh.six import Bvh6
     from wrt.accel.bvh.volumes import Bvh2Kdop, Bvh2Sphere
     from wrt.accel.bvh.wide import Bvh4, Bvh8, Bvh8c
-    from wrt.accel.cells.bsp import Bsp
     from wrt.accel.cells.grid import Grid
-    from wrt.accel.cells.kdtree import KdTree
-    from wrt.accel.cells.octree import Octree
+    from wrt.accel.cells.trees import Bsp, KdTree, Octree
 
     OneMeshLike: TypeAlias = Mesh | Geometry | trimesh.Trimesh | wp.Mesh | tuple[ArrayLike, ArrayLike]
     SceneLike: TypeAlias = Scene | InstancedGeometry | trimesh.Scene | PathLike

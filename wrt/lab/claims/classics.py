@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from wrt.accel.cells.kdtree import KdTree
+from wrt.accel.cells.trees import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.kdtree import LEAF
+from wrt.kernels.traverse.planes import KD_LEAF
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import counters_of
 from wrt.lab.claims.claim import SAME_SCENE, Claim, Figure, Study
@@ -17,7 +17,7 @@ from wrt.scene.shapes import icosphere
 def split_references(tree: KdTree) -> int:
     """Sum the number of different primitives in a cell over the cells that the build split."""
     nodes, n = tree.built.arrays["nodes"], len(tree.geometry)
-    leaf, first = (nodes["word"] & 3) == LEAF, (nodes["word"] >> 2).astype(np.int64)
+    leaf, first = (nodes["word"] & 3) == KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
     levels, level = [], np.zeros(1, np.int64)
     while len(level):
         levels.append(level)
