@@ -4,9 +4,9 @@
   Ray Tracing, and on doing that in O(N log N)". The candidates are all faces of the references' boxes; a sweep over the sorted faces finds
   the best. In a cell with more than options.sampled references, only evenly spread ones propose planes and are counted.
 - octree: a cell with many primitives is split into eight octants, if that lowers the SAH cost.
-- BSP tree: Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". One kind of candidates are the planes of triangles in the cell, and the
-  planes through their edges at right angles to the triangles. The other kind are planes across an axis at the ends of references. The SAH
-  takes the surface areas of both parts of the cell's box, and counts at most COUNTED references of the cell.
+- BSP tree: Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Candidates are the best plane across an axis, as in a k-d tree, the
+  planes of options.triangles triangles in the cell, and the planes through their edges at right angles to them. The SAH takes the surface
+  areas of both parts of the cell's box, and counts at most COUNTED references.
 
 Computations are in float64, but planes are rounded to float32 before they are tried. So a plane is the same here as in the traversal
 (kernels.traverse.planes). The proof there gives the tolerances.
@@ -22,9 +22,7 @@ from wrt.kernels.units.box import half_area
 
 LOW = wp.constant(1)  # Bits of CellWork.sides.
 HIGH = wp.constant(2)
-EXACT = wp.constant(24)  # BSP tree: in a cell of at most EXACT references, planes across an axis are tried at both ends of each reference.
-STEPS = wp.constant(32)  # In a larger cell, such planes are tried at STEPS equal steps.
-COUNTED = wp.constant(64)
+COUNTED = wp.constant(64)  # BSP tree: largest number of references that a trial of a plane counts, evenly spread.
 U = wp.constant(wp.float64(2.0**-24))
 OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # Factor that outweighs rounding down, in float64 or to float32.
 FLAT = wp.constant(wp.float64(2.0**-16))  # A reference lies in a plane if its distance is at most this fraction of its cell's size.
@@ -32,7 +30,7 @@ NO_SIZE = wp.constant(wp.float64(1e-200))
 NO_AREA = wp.constant(wp.float64(1e-30))  # A triangle with a smaller area, relative to its squared extent, gives no planes.
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
-ALIKE = wp.constant(0.9)
+ALIKE = wp.constant(0.9)  # BSP tree: two planes whose unit normals have a larger dot product cut off nearly the same.
 
 
 @wp.func
@@ -286,7 +284,7 @@ def choose_octants(shapes: Shapes, work: CellWork, cell: Cell, options: CellOpti
 
 @wp.func
 def plane_noise(split: Split, cell: Cell) -> wp.float64:
-    """Return the sum of |normal[i]| times the largest |coordinate i|, plus |offset|. Rounding errors of the plane are proportional to it."""
+    """Return the sum of |normal[i]| times the largest |coordinate i|, plus |offset|: rounding errors are proportional to it."""
     far = wp.max(wp.abs(wp.vec3d(cell.lo)), wp.abs(wp.vec3d(cell.hi)))
     return wp.dot(wp.abs(split.normal), far) + wp.abs(split.offset)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.build.clip import Box, Shapes
+from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.planes import LEAF, STACK_SIZE, BspNode, OctreeLayout

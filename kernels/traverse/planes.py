@@ -63,8 +63,8 @@ class KdNode:
 @wp.struct
 class BspNode:
     """The plane dot(normal, p) + offset = 0 and its children: one below the plane (negative values), and one above it.
-    A child without primitives has no node. The others are consecutive from node `first` on; bit k of `count` says whether child k (0: below)
-    has one. A leaf has the `count` primitives from index `first` on."""
+    A child without primitives has no node. The others are consecutive from node `first` on; bit k of `count` is 1 if child k (0: below) has
+    one. A leaf has the `count` primitives from index `first` on."""
 
     normal: wp.vec3
     offset: float

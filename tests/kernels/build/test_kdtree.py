@@ -10,16 +10,17 @@ from tests.kernels.build.test_bvh2 import CASES, geometry_of
 from tests.kernels.build.test_clip import polygon_in
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, triangles
 from tests.refused import refused
-from wrt.accel.cells.kdtree_build import Cell as BuilderCell
-from wrt.accel.cells.kdtree_build import KdOptions, binned_split, build_tree
+from wrt.accel.cells.common import bounds_of
+from wrt.accel.cells.trees import KdOptions
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE
+from wrt.kernels.traverse.planes import KD_LEAF as LEAF
+from wrt.kernels.traverse.planes import STACK_SIZE
 from wrt.scene.shapes import icosphere, torus
 
 
 def make(geometry, threads=1, **options):
-    built = build_tree(geometry, KdOptions(**options), threads)
+    built = build(geometry, "kdtree", threads=threads, **options).built
     return SimpleNamespace(**built.arrays, order=built.order, depth=built.depth, leaves=built.leaves, cost=built.sah_cost)
 
 
@@ -45,8 +46,7 @@ def cells(tree):
 
 def check_tree(geometry, tree, max_depth, growth):
     """Check that a leaf holds each primitive that reaches into it once, and no primitive whose padded box is outside."""
-    box_lo, box_hi = geometry.bounds()
-    box_hi = np.where(box_lo < box_hi, box_hi, np.nextafter(box_hi, np.float32(np.inf)))
+    box_lo, box_hi = bounds_of(geometry)
     size = np.maximum(np.abs(box_lo), np.abs(box_hi)).max(axis=1, keepdims=True).astype(np.float64)
     margin = 1e-5 * size
     corners = geometry.vertices[geometry.faces].astype(np.float64)
@@ -127,15 +127,6 @@ def test_the_split_is_the_cheapest_of_all_faces(seed):
     chosen = int(tree.nodes["word"][0]) & 3, float(tree.nodes["split"][0])
     assert expected_cost(tree, options, chosen, geometry) == pytest.approx(cheapest, rel=1e-12)
 
-    # With 64 bins for each axis the candidate planes are others. The best of them is hardly worse.
-    root = BuilderCell(tree.lo, tree.hi, np.arange(60, dtype=np.int32), lo, hi, 0, 1000, 0)
-    found = binned_split(root, options)
-    low, high = tree.lo.astype(np.float64), tree.hi.astype(np.float64)
-    planes = [(axis, low[axis] + (high[axis] - low[axis]) / 64 * np.arange(1, 64)) for axis in range(3)]
-    binned = min(expected_cost(tree, options, (axis, x), geometry) for axis, xs in planes for x in xs.astype(np.float32))
-    assert expected_cost(tree, options, found, geometry) == pytest.approx(binned, rel=1e-12)
-    assert binned < 1.1 * cheapest
-
 
 def test_empty_space_is_cut_off():
     # Eight clusters are in the corners of a cell.
@@ -153,7 +144,7 @@ def test_clipping_leaves_fewer_references():
 
 
 def test_one_and_two_threads_build_the_same_tree():
-    geometry = Geometry.of(torus(segments=48, tube_segments=24))  # More than perfect_below: the top is binned and defers tasks.
+    geometry = Geometry.of(torus(segments=96, tube_segments=32))  # More than perfect_below, and than KEEP.
     one, two = (make(geometry, threads, perfect_below=1024) for threads in (1, 2))
     assert np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order) and one.cost == two.cost
     check_tree(geometry, one, KdOptions().depth(len(geometry)), 16.0)

@@ -32,6 +32,7 @@ def listed(octree):
     """Return the leaf and the primitive of each reference."""
     nodes = octree.data.nodes.numpy()
     leaf = np.nonzero(nodes["count"] >= 0)[0]
+    leaf = leaf[np.argsort(nodes["first"][leaf], kind="stable")]
     first, count = nodes["first"][leaf], nodes["count"][leaf]
     assert np.array_equal(first, np.cumsum(count) - count) and octree.stats.leaves == len(leaf)
     return np.repeat(leaf, count), octree.data.references.numpy()
@@ -137,7 +138,7 @@ def test_random_lines_cost_what_the_statistics_expect():
     ("references", lambda a: a.__setitem__(3, 320)), ("references", lambda a: a.__setitem__(3, -1)),
     ("levels", lambda a: a.__setitem__((), 2)), ("levels", lambda a: a.__setitem__((), 21)),
     ("size", lambda a: a.__setitem__((), np.nan)), ("size", lambda a: a.__setitem__((), 1e-9)),
-    ("pad", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
+    ("extent", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
 ])
 def test_arrays_from_a_file_are_checked(name, change):
     assert_damage_is_refused(build(icosphere(2), "octree"), name, change)

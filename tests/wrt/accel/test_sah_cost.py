@@ -76,6 +76,8 @@ CASES: dict[str, list[Case]] = {
     # Without mailbox, because the SAH cost counts a primitive in every cell.
     "grid": [Case({"mailbox": False})],
     "octree": [Case({"mailbox": False})],
+    # Of a cell of a BSP tree, the SAH cost takes the box.
+    "bsp": [Case(inner=lambda counters: counters.nodes - counters.leaves, exact=False)],
     "kdtree": [Case(options, inner=lambda counters: counters.nodes - counters.leaves)  # leaves count as nodes, too
                for options in ({}, {"clip": False, "empty_bonus": 0.8}, {"max_leaf": 8, "perfect_below": 1024})],
 }

@@ -15,7 +15,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Built
 from wrt.accel.store import row_type
 from wrt.core.building import tally
-from wrt.core.device import launch, load_kernel, on_host, records, start, upload
+from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
@@ -111,7 +111,7 @@ def build_tree(name: str, shapes: WarpStruct, root: np.ndarray, options: WarpStr
 
     # The largest cells come first, so that all threads end at about the same time.
     run_all([partial(job, int(i)) for i in np.argsort(-top.deferred["count"], kind="stable")], threads)
-    return joined([top, *subtrees], float(half_area.func((root["hi"][0] - root["lo"][0].astype(np.float64)))))
+    return joined([top, *subtrees], float(half_area.func(root["hi"][0] - root["lo"][0].astype(np.float64))))
 
 
 def launched(name: str, shapes: WarpStruct, references: np.ndarray, cell: np.ndarray, options: WarpStruct) -> Subtree:
@@ -143,7 +143,7 @@ def joined(parts: list[Subtree], area: float) -> Tree:
         first_node += len(part.nodes) - 1
         first_reference += len(part.order)
     totals = np.array([part.totals for part in parts])
-    cost = float(totals["cost"].sum()) / area if area > 0.0 else float("nan")
+    cost = 0.0 if not first_reference else float(totals["cost"].sum()) / area if area > 0.0 else float("nan")
     return Tree(np.concatenate(nodes), np.concatenate([part.order for part in parts]), int(totals["leaves"].sum()),
                 int(totals["depth"].max()), cost)
 

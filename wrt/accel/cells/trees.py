@@ -235,7 +235,7 @@ def octree_layout(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
 
 
 def check_children(first: np.ndarray, mask: np.ndarray, parent: np.ndarray, n: int, levels: int) -> None:
-    """Raise InputError unless n nodes form a tree. The children of node parent[i] are consecutive from first[i] on, one a bit of mask[i]."""
+    """Raise InputError unless n nodes form a tree. Node parent[i] has one child per bit of mask[i], consecutive from node first[i] on."""
     count = np.bitwise_count(mask.astype(np.int64)).astype(np.int64)
     child = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
     check_tree(n, np.repeat(parent, count), child, levels)

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from tests.refused import Refusal, refused
+from tests.refused import refused
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
-import warp as wp
 
-import wrt.accel.cells.bsp as module
-from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, soup, triangles
-from wrt.accel.cells.bsp import Bsp
+from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, triangles
+from wrt.accel.cells import common
+from wrt.accel.cells.trees import Bsp
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.observed import copied
-from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.scenes.build import build
-from wrt.core.device import on_host
-from wrt.kernels.query import HitArrays, make_closest_hit_kernel
-from wrt.kernels.structs import Surfaces
-from wrt.kernels.traverse.bsp import PLANE, STACK_SIZE
-from wrt.kernels.traverse.observer import Counts
+from wrt.kernels.traverse.planes import LEAF, PLANE, STACK_SIZE
 from wrt.scene.shapes import icosphere
 
 
@@ -56,40 +48,19 @@ def test_an_error_of_progress_ends_the_build() -> None:
         build(icosphere(3), "bsp", progress=stop)
 
 
-def test_threads_and_room_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def arrays() -> list[np.ndarray]:
-        built = build(icosphere(3), "bsp", threads=threads).built
-        return [*built.arrays.values(), built.order]
-
-    threads = 1
-    first = arrays()
-    threads = 2
-    monkeypatch.setattr(module, "ROOM", 1)  # doubled until it suffices
-    monkeypatch.setattr(module, "SPARE", 0)
-    for one, other in zip(first, arrays(), strict=True):
-        assert np.array_equal(one, other)
-
-
-def test_a_tree_beyond_the_range_of_indices_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_ROOM", 2000)
-    with refused(hint="lower max_growth"):
-        build(icosphere(3), "bsp")
-
-
-def test_more_subtrees_than_there_is_room_for_are_built_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_SUBTREES", 2)
-    rng = np.random.default_rng(0)
-    geometry = soup(rng, 3000)
-    origin, direction = rays_for(geometry, rng, 2000)
-    assert_same_hits(build(geometry, "bsp").closest_hit(origin, direction), build(geometry, "bvh2").closest_hit(origin, direction))
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(common, "KEEP", 100)
+    one, two = (build(icosphere(3), "bsp", threads=threads).built for threads in (1, 2))
+    for name, array in one.arrays.items():
+        assert np.array_equal(array, two.arrays[name])
+    assert np.array_equal(one.order, two.order)
 
 
 def test_samples_decide_whether_there_are_tilted_planes() -> None:
-    geometry = soup(np.random.default_rng(1), 400)
-    tree, kd = build(geometry, "bsp"), build(geometry, "bsp", samples=0)
-    assert (tree.built.arrays["nodes"]["axis"] == PLANE).mean() > 0.3
-    assert (kd.built.arrays["nodes"]["axis"] < PLANE).all()
-    assert tree.stats.sah_cost < kd.stats.sah_cost and tree.stats.references < kd.stats.references
+    tree, kd = build(icosphere(3), "bsp"), build(icosphere(3), "bsp", samples=0)
+    inner, of_kd = (each.built.arrays["nodes"]["axis"] for each in (tree, kd))
+    assert (inner == PLANE).sum() > 0.3 * (inner < LEAF).sum() and not (of_kd == PLANE).any()
+    assert tree.stats.sah_cost < kd.stats.sah_cost
 
 
 @pytest.mark.parametrize("kind", ["all_equal", "coincident", "progression", "flat", "tiny_and_huge", "long_thin"])
@@ -112,21 +83,20 @@ def test_references_are_bounded(max_growth: float) -> None:
 
 def leaves_of(tree: Bsp, point: np.ndarray) -> set[int]:
     """Return the primitives of all leaves that contain a point, to within the tolerance of a plane, in float64."""
-    arrays, order = tree.built.arrays, tree.built.order
-    todo, found = [(int(arrays["first"][0]), int(arrays["count"][0]))], set()
+    nodes, order = tree.built.arrays["nodes"], tree.built.order
+    todo, found = [0], set()
     while todo:
-        first, count = todo.pop()
-        if count >= 0:
+        node = nodes[todo.pop()]
+        axis, first, count = (int(node[name]) for name in ("axis", "first", "count"))
+        if axis == LEAF:
             found |= set(order[first : first + count].tolist())
             continue
-        node = arrays["nodes"][first]
-        axis = int(node["axis"])
         value = point[axis] if axis < PLANE else np.dot(node["normal"].astype(np.float64), point)
         value += float(node["offset"])
-        if value <= node["tolerance"]:
-            todo.append((int(node["first_0"]), int(node["count_0"])))
-        if value >= -node["tolerance"]:
-            todo.append((int(node["first_1"]), int(node["count_1"])))
+        if value <= node["tolerance"] and count & 1:
+            todo.append(first)
+        if value >= -node["tolerance"] and count & 2:
+            todo.append(first + (count & 1))
     return found
 
 
@@ -200,69 +170,21 @@ def test_rays_within_the_trees_planes_lose_nothing(kind: str) -> None:
     assert tree.any_hit(origin[on], direction[on], t, t).all()
 
 
-# --- cost -------------------------------------------------------------------------------------------------------------
-
-
-@wp.func
-def never(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
-    return False
-
-
-@cache
-def refusing_kernel():
-    """Make a kernel that counts and rejects every hit, so that a ray traverses the whole structure."""
-    structure = build(icosphere(0), "bsp").structure
-    structure = structure._replace(units=structure.units._replace(observer="sum"))
-    return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False, accepts=never))
-
-
-def lines_through(lo: np.ndarray, hi: np.ndarray, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return uniform random lines through a box, as rays that begin outside."""
-    center, radius = 0.5 * (lo + hi), 0.5 * np.linalg.norm(hi - lo)
-    direction = unit(rng.normal(size=(n, 3)))
-    x = unit(np.cross(direction, rng.normal(size=(n, 3))))
-    angle, r = 2.0 * np.pi * rng.random((n, 1)), radius * np.sqrt(rng.random((n, 1)))
-    origin = center + r * (np.cos(angle) * x + np.sin(angle) * np.cross(direction, x)) - 2.0 * radius * direction
-    with np.errstate(divide="ignore"):
-        t = (np.stack([lo, hi])[:, None] - origin) / direction
-    meets = t.min(axis=0).max(axis=1) <= t.max(axis=0).min(axis=1)
-    return origin[meets].astype(np.float32), direction[meets].astype(np.float32)
-
-
-@pytest.mark.parametrize("options", [{}, {"cost_intersection": 1.0, "cost_axis": 1.0, "cost_plane": 1.0}, {"samples": 0}])
-@pytest.mark.parametrize("kind", ["soup", "ball", "turned_grid"])
-def test_random_lines_cost_what_the_heuristic_says(kind: str, options: dict[str, float]) -> None:
-    rng = np.random.default_rng(5)
-    tree = build(HARD[kind](rng), "bsp", **options)
-    lo, hi = (np.array(tree.built.arrays[name], np.float64) for name in ("lo", "hi"))
-    rays = rays_on(tree.device, rays_of(*lines_through(lo, hi, rng, 40_000), 0.0, np.inf))
-    hits = HitArrays()
-    hits.t, hits.u, hits.v = (wp.zeros(len(rays.t_min), dtype=wp.float32, device=tree.device) for _ in range(3))
-    hits.prim_id = wp.zeros(len(rays.t_min), dtype=wp.int32, device=tree.device)
-    data = copied(tree.data)
-    data.recorder.counts = wp.zeros(len(rays.t_min), dtype=Counts, device=tree.device)
-    data.recorder.first, data.recorder.fetches = (wp.zeros(0, dtype=wp.int64, device=tree.device) for _ in range(2))
-    wp.launch(refusing_kernel(), dim=len(rays.t_min), inputs=[data, tree.snapshot.surfaces, rays, hits, 0], device=tree.device)
-    counts = on_host(data.recorder.counts)
-    steps = counts["nodes"] + counts["primitives"]
-    assert abs(steps.mean() - tree.stats.sah_cost) < 3.0 * steps.std() / np.sqrt(len(steps))
-
-
 # --- arrays from a file -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("field", "row", "value", "message"), [
-    ("first_0", 0, 0, (None, "leads out")), ("first_1", 0, 10**8, (None, "leads out")), ("count_0", 0, -2, (None, "leads out")),
-    ("axis", 2, 4, (None, "axis is out")),
-    ("axis", 2, -1, (None, "axis is out")), ("count_1", 0, 0, (None, "form a tree")), ("first_0", 0, 2, (None, "form a tree"))])
-def test_a_damaged_tree_is_refused(field: str, row: int, value: int, message: Refusal) -> None:
+    ("first", 0, 0, "form a tree"), ("first", 0, 10**8, "form a tree"), ("count", 0, 0, "axis or count"), ("count", 0, 4, "axis or count"),
+    ("count", 0, 1, "form a tree"), ("axis", 2, 5, "axis or count"), ("axis", 2, -1, "axis or count"), ("axis", 0, LEAF, "form a tree"),
+    ("first", -1, -1, "leads out"), ("count", -1, 10**8, "leads out")])
+def test_a_damaged_tree_is_refused(field: str, row: int, value: int, message: str) -> None:
     tree = build(icosphere(2), "bsp")
     nodes = tree.built.arrays["nodes"].copy()
-    assert nodes["count_0"][0] == nodes["count_1"][0] == -1
+    assert nodes["count"][0] == 3 and nodes["axis"][-1] == LEAF
     nodes[field][row] = value
     spoiled = replace(tree.built, arrays=tree.built.arrays | {"nodes": nodes})
-    with refused(*message):
+    with refused(what=message):
         Bsp.restore(spoiled, tree.geometry)
-    with refused(what="one root"):
-        Bsp.restore(replace(tree.built, arrays=tree.built.arrays | {"first": np.zeros(2, np.int32)}), tree.geometry)
+    with refused(what="wrong size"):
+        Bsp.restore(replace(tree.built, arrays=tree.built.arrays | {"lo": np.zeros(2, np.float32)}), tree.geometry)
     assert isinstance(Bsp.restore(tree.built, tree.geometry), Bsp)
