@@ -6,8 +6,8 @@ the other cells at the edge or corner. The walk visits exactly the cells that th
 **Margins.** A cell lists the triangles that meet it, not all triangles whose boxes meet it. Before clamping, a hit is on its triangle,
 except for the triangle's pad and a few roundings. So it is in a cell that lists the triangle. Then t is clamped to the interval of the
 triangle's box (kernels.units.triangle.within_bounds). This moves the hit by up to the pad at right angles to a face of the box. That is far
-along a grazing ray. So the final hit lies up to `cell_slack` before or behind the cells that list its triangle. The walk begins by cell_slack
-before t_min, and continues by cell_slack behind its best hit."""
+along a grazing ray. So the final hit lies up to `cell_slack` before or behind the cells that list its triangle. The walk begins by
+cell_slack before t_min, and continues by cell_slack behind its best hit."""
 
 from functools import cache
 from typing import Any
