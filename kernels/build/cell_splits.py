@@ -44,6 +44,49 @@ def across_axis(axis: int, position: wp.float64) -> Split:
 
 
 @wp.func
+def mean_of_clamped(x_0: wp.float64, x_1: wp.float64) -> wp.float64:
+    """Return the mean of clamp(x, 0, 1) over the interval x_0 .. x_1."""
+    low = wp.clamp(x_0, ZERO, ONE)
+    high = wp.clamp(x_1, ZERO, ONE)
+    if x_1 - x_0 < wp.float64(1e-9):
+        return high
+    return (wp.float64(0.5) * (high - low) * (high + low) + wp.max(x_1 - wp.max(x_0, ONE), ZERO)) / (x_1 - x_0)
+
+
+@wp.func
+def share_above(low: wp.float64, u: wp.float64, v: wp.float64) -> wp.float64:
+    """Return the share of the unit square where low + u x + v y >= 0, for u and v of at least 0."""
+    steep = wp.max(u, v)
+    if steep == ZERO:
+        return wp.where(low >= ZERO, ONE, ZERO)
+    # At each place along the flat direction, the share of the steep direction that is above is 1 + (low + flat s) / steep, clamped.
+    return mean_of_clamped(ONE + low / steep, ONE + (low + wp.min(u, v)) / steep)
+
+
+@wp.func
+def areas_of_parts(cell: Cell, split: Split) -> wp.vec2d:
+    """Return the shares (below, above) of the surface area of a cell's box that its parts have, with the cut. (0, 0): the plane misses it.
+    The area vectors of a closed surface have the sum 0, so that the cut's is minus that of the parts of the six faces."""
+    e = wp.vec3d(cell.hi) - wp.vec3d(cell.lo)
+    step = wp.cw_mul(wp.abs(split.normal), e)
+    middle = wp.float64(0.5) * wp.dot(split.normal, wp.vec3d(cell.lo) + wp.vec3d(cell.hi)) + split.offset
+    low = middle - wp.float64(0.5) * (step[0] + step[1] + step[2])
+    if low >= ZERO or low + step[0] + step[1] + step[2] <= ZERO:
+        return wp.vec2d(ZERO, ZERO)
+    above = ZERO
+    cut = wp.vec3d()
+    for axis in range(3):
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
+        near = e[u] * e[v] * share_above(low, step[u], step[v])
+        far = e[u] * e[v] * share_above(low + step[axis], step[u], step[v])
+        above += near + far
+        cut[axis] = far - near
+    total = wp.float64(2.0) * half_area(e)
+    return wp.vec2d((total - above + wp.length(cut)) / total, (above + wp.length(cut)) / total)
+
+
+@wp.func
 def half_cell(cell: Cell, split: Split, options: CellOptions, k: int) -> Cell:
     """Return the part of a cell below (k = 0) or above a plane, with the box around that part of the cell's box."""
     out = cell
@@ -52,7 +95,9 @@ def half_cell(cell: Cell, split: Split, options: CellOptions, k: int) -> Cell:
             out.hi[split.axis] = float(-split.offset)
         else:
             out.lo[split.axis] = float(-split.offset)
+        out.area = cell.area * (half_area(wp.vec3d(out.hi) - wp.vec3d(out.lo)) / half_area(wp.vec3d(cell.hi) - wp.vec3d(cell.lo)))
         return out
+    out.area = cell.area * areas_of_parts(cell, split)[k]
     out.wall_1 = cell.wall_0
     out.wall_0 = wp.vec3(wp.where(k == 0, -split.normal, split.normal))
     # On the side where n . p + d >= 0, coordinate i has n_i p_i >= -(d + the largest sum of the other terms).
@@ -232,6 +277,7 @@ def octant(cell: Cell, split: Split, options: CellOptions, k: int) -> Cell:
     out.corner = cell.corner + octant_corner(k, half)
     out.lo = octree_planes(options.layout, out.corner)
     out.hi = octree_planes(options.layout, out.corner + wp.vec3i(half, half, half))
+    out.area = half_area(wp.vec3d(out.hi) - wp.vec3d(out.lo))
     return out
 
 
@@ -271,10 +317,8 @@ def choose_octants(shapes: Shapes, work: CellWork, cell: Cell, options: CellOpti
         for i in range(cell.first, cell.first + cell.count):
             count += (int(work.sides[i]) >> k) & 1
         if count > 0:
-            part = octant(cell, split, options, k)
-            cost += half_area(wp.vec3d(part.hi) - wp.vec3d(part.lo)) * wp.float64(count + 1)
-    leaf = half_area(wp.vec3d(cell.hi) - wp.vec3d(cell.lo)) * wp.float64(cell.count)
-    if total > cell.budget or (options.by_cost != 0 and not cost < leaf):
+            cost += octant(cell, split, options, k).area * wp.float64(count + 1)
+    if total > cell.budget or (options.by_cost != 0 and not cost < cell.area * wp.float64(cell.count)):
         split.axis = LEAF
     return split
 
@@ -293,49 +337,6 @@ def plane_noise(split: Split, cell: Cell) -> wp.float64:
 def pad_of(cell: Cell, split: Split) -> wp.float64:
     """Return Split.pad. A ray within a plane's tolerance visits both sides, so cutting off a thinner sliver saves nothing."""
     return wp.max(FLAT * wp.float64(wp.max(cell.hi - cell.lo)), wp.float64(2.0) * U * plane_noise(split, cell))
-
-
-@wp.func
-def mean_of_clamped(x_0: wp.float64, x_1: wp.float64) -> wp.float64:
-    """Return the mean of clamp(x, 0, 1) over the interval x_0 .. x_1."""
-    low = wp.clamp(x_0, ZERO, ONE)
-    high = wp.clamp(x_1, ZERO, ONE)
-    if x_1 - x_0 < wp.float64(1e-9):
-        return high
-    return (wp.float64(0.5) * (high - low) * (high + low) + wp.max(x_1 - wp.max(x_0, ONE), ZERO)) / (x_1 - x_0)
-
-
-@wp.func
-def share_above(low: wp.float64, u: wp.float64, v: wp.float64) -> wp.float64:
-    """Return the share of the unit square where low + u x + v y >= 0, for u and v of at least 0."""
-    steep = wp.max(u, v)
-    if steep == ZERO:
-        return wp.where(low >= ZERO, ONE, ZERO)
-    # At each place along the flat direction, the share of the steep direction that is above is 1 + (low + flat s) / steep, clamped.
-    return mean_of_clamped(ONE + low / steep, ONE + (low + wp.min(u, v)) / steep)
-
-
-@wp.func
-def areas_of_parts(cell: Cell, split: Split) -> wp.vec2d:
-    """Return the shares (below, above) of the surface area of a cell's box that its parts have, with the cut. (0, 0): the plane misses it.
-    The area vectors of a closed surface have the sum 0, so that the cut's is minus that of the parts of the six faces."""
-    e = wp.vec3d(cell.hi) - wp.vec3d(cell.lo)
-    step = wp.cw_mul(wp.abs(split.normal), e)
-    middle = wp.float64(0.5) * wp.dot(split.normal, wp.vec3d(cell.lo) + wp.vec3d(cell.hi)) + split.offset
-    low = middle - wp.float64(0.5) * (step[0] + step[1] + step[2])
-    if low >= ZERO or low + step[0] + step[1] + step[2] <= ZERO:
-        return wp.vec2d(ZERO, ZERO)
-    above = ZERO
-    cut = wp.vec3d()
-    for axis in range(3):
-        u = (axis + 1) % 3
-        v = (axis + 2) % 3
-        near = e[u] * e[v] * share_above(low, step[u], step[v])
-        far = e[u] * e[v] * share_above(low + step[axis], step[u], step[v])
-        above += near + far
-        cut[axis] = far - near
-    total = wp.float64(2.0) * half_area(e)
-    return wp.vec2d((total - above + wp.length(cut)) / total, (above + wp.length(cut)) / total)
 
 
 @wp.func

@@ -12,7 +12,6 @@ from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.planes import LEAF, STACK_SIZE, BspNode, OctreeLayout
-from wrt.kernels.units.box import half_area
 
 DEFERRED = wp.constant(-1)  # `axis` of a node that a later launch builds; `first` is the index of its cell in CellOutput.deferred
 OCTANTS = wp.constant(5)  # `axis` of the node of an octree's cell; `count` is the mask of its octants
@@ -26,6 +25,7 @@ class Cell:
     lo: wp.vec3  # lo, hi: its box. The cell of a BSP tree may be smaller.
     hi: wp.vec3
     corner: wp.vec3i  # Octree: lowest corner, in units of the finest cells.
+    area: wp.float64  # Half its surface area; in a BSP tree estimated from the parts of boxes.
     wall_0: wp.vec3  # BSP tree: normals, inwards, of the last planes above the cell that are not across an axis.
     wall_1: wp.vec3
     first: int
@@ -107,7 +107,7 @@ class Rule(NamedTuple):
     parts: int
     keeps_empty: bool  # True: a part without references has a node.
     choose: Any  # (shapes, work, cell, options) -> Split, which also writes work.sides
-    part: Any  # (cell, split, options, k) -> Cell: the box, and the corner, of part k
+    part: Any  # (cell, split, options, k) -> Cell: box, corner and area of part k
     clip: Any  # (shapes, reference, split, k, straddles) -> Box of the reference in part k; straddles: other parts list it, too
 
 
@@ -122,7 +122,7 @@ def write_leaf(work: CellWork, cell: Cell, options: CellOptions, out: CellOutput
         out.order[totals.references + i] = work.references[cell.first + i].prim_id
     totals.references += cell.count
     totals.leaves += 1
-    totals.cost += half_area(wp.vec3d(cell.hi) - wp.vec3d(cell.lo)) * wp.float64(cell.count + options.leaf_visit)
+    totals.cost += cell.area * wp.float64(cell.count + options.leaf_visit)
     return totals
 
 
@@ -218,7 +218,7 @@ def make_build_cells(rule: Rule) -> Any:
             node.axis = split.axis
             node.first = totals.nodes
             out.nodes[cell.slot] = node
-            totals.cost += half_area(wp.vec3d(cell.hi) - wp.vec3d(cell.lo))
+            totals.cost += cell.area
             for k in range(begin, size):
                 stack[k].slot = totals.nodes + k - begin
                 stack[k].budget = int(wp.int64(cell.budget) * wp.int64(stack[k].budget) / wp.int64(listed))

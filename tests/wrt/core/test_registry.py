@@ -127,4 +127,4 @@ def test_a_render_imports_only_its_own_structure() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = done.stdout.split()
     assert "wrt.accel.bvh.wide" in loaded
-    assert not {"wrt.accel.cells.bsp", "wrt.accel.cells.kdtree", "wrt.kernels.build.sbvh", "wrt.kernels.build.bsp"} & set(loaded)
+    assert not {"wrt.accel.cells.trees", "wrt.kernels.build.sbvh", "wrt.kernels.build.cells"} & set(loaded)

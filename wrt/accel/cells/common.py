@@ -24,7 +24,6 @@ from wrt.kernels.build.cell_splits import RULES
 from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
 from wrt.kernels.traverse.planes import LEAF, BspNode
-from wrt.kernels.units.box import half_area
 from wrt.kernels.warp_private import fields_of
 
 # Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.
@@ -111,7 +110,7 @@ def build_tree(name: str, shapes: WarpStruct, root: np.ndarray, options: WarpStr
 
     # The largest cells come first, so that all threads end at about the same time.
     run_all([partial(job, int(i)) for i in np.argsort(-top.deferred["count"], kind="stable")], threads)
-    return joined([top, *subtrees], float(half_area.func(root["hi"][0] - root["lo"][0].astype(np.float64))))
+    return joined([top, *subtrees], float(root["area"][0]))
 
 
 def launched(name: str, shapes: WarpStruct, references: np.ndarray, cell: np.ndarray, options: WarpStruct) -> Subtree:

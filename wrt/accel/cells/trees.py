@@ -27,7 +27,7 @@ from wrt.core.errors import InputError
 from wrt.core.types import WarpStruct
 from wrt.kernels.build.cells import Cell, CellOptions
 from wrt.kernels.traverse import planes as kernels
-from wrt.kernels.units.box import PAD_EXTENT
+from wrt.kernels.units.box import PAD_EXTENT, half_area
 
 MAX_IN_LEAF = 1 << 24  # primitives, because a node stores their number as a float32.
 MAX_INDEX = 1 << 29  # Of a node or reference, because a node's word has 29 bits for it.
@@ -120,7 +120,7 @@ class Bsp(OneMesh):
     """A BSP tree, whose planes have any orientation. Options: BspOptions. The option `box` has no effect.
 
     Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Only the planes of some triangles of a cell are tried. The SAH takes the
-    surface areas of the cells' boxes, so that AccelStats.sah_cost is an upper estimate.
+    surface areas of parts of boxes, so that AccelStats.sah_cost is an estimate.
     """
 
     name = "bsp"
@@ -212,6 +212,7 @@ def root_of(bounds: tuple[np.ndarray, np.ndarray], max_growth: float, spare: int
     """Return the cell of the root, (1,), with a budget of max_growth references per primitive, and `spare` more."""
     root, n = records(Cell, 1), len(bounds[0])
     root["lo"], root["hi"] = bounds[0].min(axis=0, initial=np.inf), bounds[1].max(axis=0, initial=-np.inf)
+    root["area"] = half_area.func(np.moveaxis(root["hi"].astype(np.float64) - root["lo"], 1, 0))
     root["count"], root["budget"] = n, int(min(max_growth * n + spare, MAX_REFERENCES))
     return root
 

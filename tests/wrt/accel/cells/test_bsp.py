@@ -60,7 +60,6 @@ def test_samples_decide_whether_there_are_tilted_planes() -> None:
     tree, kd = build(icosphere(3), "bsp"), build(icosphere(3), "bsp", samples=0)
     inner, of_kd = (each.built.arrays["nodes"]["axis"] for each in (tree, kd))
     assert (inner == PLANE).sum() > 0.3 * (inner < LEAF).sum() and not (of_kd == PLANE).any()
-    assert tree.stats.sah_cost < kd.stats.sah_cost
 
 
 @pytest.mark.parametrize("kind", ["all_equal", "coincident", "progression", "flat", "tiny_and_huge", "long_thin"])

@@ -13,7 +13,7 @@ import pytest
 from tests.rewalk import INF, WalkRay
 from tests.rewalk import rays as with_hits
 from wrt.accel.bvh.six import Bvh6
-from wrt.accel.cells.kdtree import KdTree
+from wrt.accel.cells.trees import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.kernels.study.k_hits import KEPT
 from wrt.lab.claims.classics import split_references
