@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.snapshot import Built
 from wrt.accel.cells.common import (
     MAX_REFERENCES,
     bounds_of,
@@ -20,6 +19,7 @@ from wrt.accel.cells.common import (
     require_between,
     shapes_of,
 )
+from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.checks import shown
 from wrt.core.device import records
@@ -45,7 +45,7 @@ class KdOptions:
     cost_traversal: float = 2.0  # SAH cost of a node.
     cost_intersection: float = 1.0  # SAH cost of a primitive.
     empty_bonus: float = 0.1  # Discount, 0 to 1, for splits that cut off empty space.
-    perfect_below: int = 65536  # In cells with more primitives, so many of them, evenly spread, choose the plane.
+    perfect_below: int = 1024  # In cells with more primitives, so many of them, evenly spread, choose the plane.
     clip: bool = True  # Clip triangles to cells exactly.
     max_growth: float = 16.0  # Limit of references and empty leaves per primitive.
 
@@ -103,7 +103,7 @@ class BspOptions:
     cost_intersection: float = 1.0  # SAH cost of a primitive.
     cost_axis: float = 1.0  # SAH cost of a node with an axis-aligned plane.
     cost_plane: float = 1.0  # SAH cost of any other node.
-    samples: int = 4  # Triangles per cell, evenly spread over its list, that propose four planes each; 0: a k-d tree.
+    samples: int = 2  # Triangles per cell, evenly spread over its list, that propose four planes each; 0: a k-d tree.
     max_depth: int = 0  # From 1 to 60; 0: 16 + 2 log2 of the number of primitives.
     max_growth: float = 16.0  # Limit of references per primitive, 1 to 1000.
     max_triangles: int = 500_000  # Largest number of primitives.

@@ -1,4 +1,4 @@
-"""Hard cases of the octree's walk: rays in the planes and through the corners of cells. It visits few nodes."""
+"""Hard cases of walks through cells: far and grazing rays, rays in planes and through corners of cells. The octree visits few nodes."""
 
 
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests.cell_cases import assert_rays_at_corners_agree, assert_same, soup
+from tests.cell_cases import assert_rays_at_corners_agree, assert_same, grazing, soup
 from tests.rewalk import PRIMITIVES
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -78,3 +78,39 @@ def test_the_walk_ends_at_the_hit_and_at_t_max_and_passes_over_empty_space():
     assert outside.nodes[0] <= depth + 2 and through.nodes[0] <= 2 * depth and outside.leaves[0] <= 2
     near = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], 0.0, 0.001, counters=True).counters
     assert near.leaves[0] == 0 and near.nodes[0] <= 3
+
+
+# --- far and grazing rays, whose rounding errors are as large as cells -------------------------------------------------
+
+
+FINE = {"grid": {"density": 100.0}, "octree": {"max_leaf": 1, "by_cost": False, "max_growth": 100.0}, "kdtree": {"cost_traversal": 0.1},
+        "bsp": {"cost_intersection": 10.0}}
+
+
+@pytest.mark.parametrize("name", FINE)
+@pytest.mark.parametrize("distance", [1e2, 1e4, 1e6, 1e8])
+def test_far_origins(distance, name):
+    # From a distance of 1e6 on, rounding is as wide as a cell. The walk then visits more cells, up to all cells.
+    rng = np.random.default_rng(2)
+    geometry = soup(rng, size=0.3)
+    cells, brute = build(geometry, name), build(geometry, "brute_force")
+    away = distance * unit(rng.normal(size=(3000, 3)))
+    away[::5] *= [1.0, 0.0, 0.0]
+    origin = rounded(rng.uniform(-1.0, 1.0, (3000, 3)) + away)
+    direction = rounded(rng.uniform(-1.0, 1.0, (3000, 3)) - origin)
+    direction[~direction.any(axis=1), 0] = 1.0
+    expected = brute.closest_hit(origin, direction)
+    assert_same(cells.closest_hit(origin, direction), expected)
+    assert (expected.prim_id >= 0).sum() > 300
+
+
+@pytest.mark.parametrize("name", FINE)
+def test_grazing_rays_find_the_same(name):
+    geometry, origin, direction = grazing(np.random.default_rng(3), 50_000)
+    cells, brute = build(geometry, name, **FINE[name]), build(geometry, "brute_force")
+    expected = brute.closest_hit(origin, direction)
+    assert (expected.prim_id >= 0).sum() > 5000
+    assert_same(cells.closest_hit(origin, direction), expected)
+    hit = expected.prim_id >= 0
+    at = expected.t[hit]
+    assert_same(cells.closest_hit(origin[hit], direction[hit], at, at), brute.closest_hit(origin[hit], direction[hit], at, at))
