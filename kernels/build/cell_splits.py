@@ -15,9 +15,10 @@ Computations are in float64, but planes are rounded to float32 before they are t
 import warp as wp
 
 from wrt.kernels.build.cells import OCTANTS, Cell, CellOptions, CellWork, Rule, Split
-from wrt.kernels.build.clip import Box, Shapes, clip_to_cell, corner_of, meets_cell, triangle_cell
+from wrt.kernels.build.clip import ZERO, Box, Shapes, areas_of_parts, clip_to_cell, corner_of, meets_cell, triangle_cell
 from wrt.kernels.build.records import BuildRecord
-from wrt.kernels.traverse.planes import LEAF, PLANE, SMALLEST, octant_corner, octree_planes
+from wrt.kernels.traverse.plane_layouts import LEAF, PLANE, octant_corner, octree_planes
+from wrt.kernels.traverse.planes import SMALLEST
 from wrt.kernels.units.box import half_area
 
 LOW = wp.constant(1)  # Bits of CellWork.sides.
@@ -28,8 +29,6 @@ OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # Factor that outweighs roun
 FLAT = wp.constant(wp.float64(2.0**-16))  # A reference lies in a plane if its distance is at most this fraction of its cell's size.
 NO_SIZE = wp.constant(wp.float64(1e-200))
 NO_AREA = wp.constant(wp.float64(1e-30))  # A triangle with a smaller area, relative to its squared extent, gives no planes.
-ZERO = wp.constant(wp.float64(0.0))
-ONE = wp.constant(wp.float64(1.0))
 ALIKE = wp.constant(0.9)  # BSP tree: two planes whose unit normals have a larger dot product cut off nearly the same.
 
 
@@ -44,49 +43,6 @@ def across_axis(axis: int, position: wp.float64) -> Split:
 
 
 @wp.func
-def mean_of_clamped(x_0: wp.float64, x_1: wp.float64) -> wp.float64:
-    """Return the mean of clamp(x, 0, 1) over the interval x_0 .. x_1."""
-    low = wp.clamp(x_0, ZERO, ONE)
-    high = wp.clamp(x_1, ZERO, ONE)
-    if x_1 - x_0 < wp.float64(1e-9):
-        return high
-    return (wp.float64(0.5) * (high - low) * (high + low) + wp.max(x_1 - wp.max(x_0, ONE), ZERO)) / (x_1 - x_0)
-
-
-@wp.func
-def share_above(low: wp.float64, u: wp.float64, v: wp.float64) -> wp.float64:
-    """Return the share of the unit square where low + u x + v y >= 0, for u and v of at least 0."""
-    steep = wp.max(u, v)
-    if steep == ZERO:
-        return wp.where(low >= ZERO, ONE, ZERO)
-    # At each place along the flat direction, the share of the steep direction that is above is 1 + (low + flat s) / steep, clamped.
-    return mean_of_clamped(ONE + low / steep, ONE + (low + wp.min(u, v)) / steep)
-
-
-@wp.func
-def areas_of_parts(cell: Cell, split: Split) -> wp.vec2d:
-    """Return the shares (below, above) of the surface area of a cell's box that its parts have, with the cut. (0, 0): the plane misses it.
-    The area vectors of a closed surface have the sum 0, so that the cut's is minus that of the parts of the six faces."""
-    e = wp.vec3d(cell.hi) - wp.vec3d(cell.lo)
-    step = wp.cw_mul(wp.abs(split.normal), e)
-    middle = wp.float64(0.5) * wp.dot(split.normal, wp.vec3d(cell.lo) + wp.vec3d(cell.hi)) + split.offset
-    low = middle - wp.float64(0.5) * (step[0] + step[1] + step[2])
-    if low >= ZERO or low + step[0] + step[1] + step[2] <= ZERO:
-        return wp.vec2d(ZERO, ZERO)
-    above = ZERO
-    cut = wp.vec3d()
-    for axis in range(3):
-        u = (axis + 1) % 3
-        v = (axis + 2) % 3
-        near = e[u] * e[v] * share_above(low, step[u], step[v])
-        far = e[u] * e[v] * share_above(low + step[axis], step[u], step[v])
-        above += near + far
-        cut[axis] = far - near
-    total = wp.float64(2.0) * half_area(e)
-    return wp.vec2d((total - above + wp.length(cut)) / total, (above + wp.length(cut)) / total)
-
-
-@wp.func
 def half_cell(cell: Cell, split: Split, options: CellOptions, k: int) -> Cell:
     """Return the part of a cell below (k = 0) or above a plane, with the box around that part of the cell's box."""
     out = cell
@@ -97,7 +53,7 @@ def half_cell(cell: Cell, split: Split, options: CellOptions, k: int) -> Cell:
             out.lo[split.axis] = float(-split.offset)
         out.area = cell.area * (half_area(wp.vec3d(out.hi) - wp.vec3d(out.lo)) / half_area(wp.vec3d(cell.hi) - wp.vec3d(cell.lo)))
         return out
-    out.area = cell.area * areas_of_parts(cell, split)[k]
+    out.area = cell.area * areas_of_parts(wp.vec3d(cell.lo), wp.vec3d(cell.hi), split.normal, split.offset)[k]
     out.wall_1 = cell.wall_0
     out.wall_0 = wp.vec3(wp.where(k == 0, -split.normal, split.normal))
     # On the side where n . p + d >= 0, coordinate i has n_i p_i >= -(d + the largest sum of the other terms).
@@ -342,7 +298,7 @@ def pad_of(cell: Cell, split: Split) -> wp.float64:
 @wp.func
 def cheaper(shapes: Shapes, work: CellWork, cell: Cell, options: CellOptions, trial: Split, best: Split) -> Split:
     """Compute the cost of a trial split of a cell, and return the cheaper of `trial` and `best`. Stop once the cost reaches best.cost."""
-    shares = areas_of_parts(cell, trial)
+    shares = areas_of_parts(wp.vec3d(cell.lo), wp.vec3d(cell.hi), trial.normal, trial.offset)
     if shares[0] == ZERO:
         return best
     trial.pad = pad_of(cell, trial)

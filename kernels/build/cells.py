@@ -11,7 +11,8 @@ import warp as wp
 from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
 from wrt.kernels.structs import kernel
-from wrt.kernels.traverse.planes import LEAF, STACK_SIZE, BspNode, OctreeLayout
+from wrt.kernels.traverse.plane_layouts import LEAF, BspNode, OctreeLayout
+from wrt.kernels.traverse.planes import STACK_SIZE
 
 DEFERRED = wp.constant(-1)  # `axis` of a node that a later launch builds; `first` is the index of its cell in CellOutput.deferred
 OCTANTS = wp.constant(5)  # `axis` of the node of an octree's cell; `count` is the mask of its octants
@@ -127,6 +128,19 @@ def write_leaf(work: CellWork, cell: Cell, options: CellOptions, out: CellOutput
 
 
 @wp.func
+def write_node(out: CellOutput, cell: Cell, split: Split, first: int, mask: int):
+    """Write an inner node, whose children are consecutive from `first` on; mask: the parts that have a node."""
+    node = BspNode()
+    node.normal = wp.vec3(split.normal)
+    node.offset = float(split.offset)
+    node.tolerance = split.tolerance
+    node.axis = split.axis
+    node.first = first
+    node.count = mask
+    out.nodes[cell.slot] = node
+
+
+@wp.func
 def defer(work: CellWork, cell: Cell, out: CellOutput, totals: CellTotals) -> CellTotals:
     """Store a cell and its references for a later launch."""
     node = BspNode()
@@ -142,11 +156,9 @@ def defer(work: CellWork, cell: Cell, out: CellOutput, totals: CellTotals) -> Ce
     return totals
 
 
-@cache
-def make_build_cells(rule: Rule) -> Any:
-    """Make the kernel build_cells of a kind of tree."""
-    parts = rule.parts
-    choose, part_of, clip = rule.choose, rule.part, rule.clip
+def make_divide(rule: Rule) -> Any:
+    """Make divide(shapes, work, cell, split, options, k, total) -> Cell."""
+    part_of, clip = rule.part, rule.clip
 
     @wp.func
     def divide(shapes: Shapes, work: CellWork, cell: Cell, split: Split, options: CellOptions, k: int, total: int) -> Cell:
@@ -168,6 +180,14 @@ def make_build_cells(rule: Rule) -> Any:
                     work.parts[total + part.count] = reference
                     part.count += 1
         return part
+
+    return divide
+
+
+@cache
+def make_build_cells(rule: Rule) -> Any:
+    """Make the kernel build_cells of a kind of tree."""
+    parts, choose, divide = rule.parts, rule.choose, make_divide(rule)
 
     @kernel
     def build_cells(shapes: Shapes, records: wp.array(dtype=BuildRecord), roots: wp.array(dtype=Cell), options: CellOptions,
@@ -199,12 +219,12 @@ def make_build_cells(rule: Rule) -> Any:
             begin = size
             total = int(0)
             listed = int(0)
-            node = BspNode()
+            mask = int(0)
             for k in range(parts):
                 part = divide(shapes, work, cell, split, options, k, total)
                 total += part.count
                 if part.count > 0 or wp.static(rule.keeps_empty):
-                    node.count = node.count | (1 << k)
+                    mask = mask | (1 << k)
                     part.budget = wp.max(part.budget, 1)
                     listed += part.budget
                     part.depth = cell.depth + 1
@@ -212,12 +232,7 @@ def make_build_cells(rule: Rule) -> Any:
                     size = size + 1
             for i in range(total):
                 work.references[cell.first + i] = work.parts[i]
-            node.normal = wp.vec3(split.normal)
-            node.offset = float(split.offset)
-            node.tolerance = split.tolerance
-            node.axis = split.axis
-            node.first = totals.nodes
-            out.nodes[cell.slot] = node
+            write_node(out, cell, split, totals.nodes, mask)
             totals.cost += cell.area
             for k in range(begin, size):
                 stack[k].slot = totals.nodes + k - begin

@@ -5,10 +5,12 @@ on the triangle lies in a leaf that does not list the triangle."""
 
 import warp as wp
 
-from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT
+from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, half_area
 
 CLIP_EXTENT = wp.constant(wp.float64(2.0 * PAD_EXTENT))
 CLIP_COORDINATE = wp.constant(wp.float64(PAD_COORDINATE))
+ZERO = wp.constant(wp.float64(0.0))
+ONE = wp.constant(wp.float64(1.0))
 MAX_CORNERS = 13  # 3 of a triangle, 1 more for each of seven planes, and 3 in case that rounding adds some
 
 
@@ -206,3 +208,46 @@ def meets_cell(triangle: TriangleCell, lo: wp.vec3, hi: wp.vec3) -> bool:
     if edge_apart(c - b, b, a, half):
         return False
     return not edge_apart(a - c, c, b, half)
+
+
+@wp.func
+def mean_of_clamped(x_0: wp.float64, x_1: wp.float64) -> wp.float64:
+    """Return the mean of clamp(x, 0, 1) over the interval x_0 .. x_1."""
+    low = wp.clamp(x_0, ZERO, ONE)
+    high = wp.clamp(x_1, ZERO, ONE)
+    if x_1 - x_0 < wp.float64(1e-9):
+        return high
+    return (wp.float64(0.5) * (high - low) * (high + low) + wp.max(x_1 - wp.max(x_0, ONE), ZERO)) / (x_1 - x_0)
+
+
+@wp.func
+def share_above(low: wp.float64, u: wp.float64, v: wp.float64) -> wp.float64:
+    """Return the share of the unit square where low + u x + v y >= 0, for u and v of at least 0."""
+    steep = wp.max(u, v)
+    if steep == ZERO:
+        return wp.where(low >= ZERO, ONE, ZERO)
+    # At each place along the flat direction, the share of the steep direction that is above is 1 + (low + flat s) / steep, clamped.
+    return mean_of_clamped(ONE + low / steep, ONE + (low + wp.min(u, v)) / steep)
+
+
+@wp.func
+def areas_of_parts(lo: wp.vec3d, hi: wp.vec3d, normal: wp.vec3d, offset: wp.float64) -> wp.vec2d:
+    """Return the shares (below, above) of a box's surface area that its parts have, with the cut; (0, 0): the plane misses the box.
+    The area vectors of a closed surface have the sum 0, so that the cut's is minus that of the parts of the six faces."""
+    e = hi - lo
+    step = wp.cw_mul(wp.abs(normal), e)
+    middle = wp.float64(0.5) * wp.dot(normal, lo + hi) + offset
+    low = middle - wp.float64(0.5) * (step[0] + step[1] + step[2])
+    if low >= ZERO or low + step[0] + step[1] + step[2] <= ZERO:
+        return wp.vec2d(ZERO, ZERO)
+    above = ZERO
+    cut = wp.vec3d()
+    for axis in range(3):
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
+        near = e[u] * e[v] * share_above(low, step[u], step[v])
+        far = e[u] * e[v] * share_above(low + step[axis], step[u], step[v])
+        above += near + far
+        cut[axis] = far - near
+    total = wp.float64(2.0) * half_area(e)
+    return wp.vec2d((total - above + wp.length(cut)) / total, (above + wp.length(cut)) / total)

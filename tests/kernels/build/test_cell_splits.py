@@ -9,22 +9,16 @@ from tests.kernel_tools import DEVICE, launch, unit  # isort: skip (starts Warp)
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from wrt.kernels.build.cell_splits import areas_of_parts, plane_through
-from wrt.kernels.build.cells import Cell, Split
+from wrt.kernels.build.cell_splits import plane_through
+from wrt.kernels.build.clip import areas_of_parts
 from wrt.kernels.structs import kernel
 
 
 @kernel
 def measure(lo: wp.vec3, hi: wp.vec3, planes: wp.array(dtype=wp.vec4d), out: wp.array(dtype=wp.vec2d)):
     i = wp.tid()
-    cell = Cell()
-    cell.lo = lo
-    cell.hi = hi
-    split = Split()
     plane = planes[i]
-    split.normal = wp.vec3d(plane[0], plane[1], plane[2])
-    split.offset = plane[3]
-    out[i] = areas_of_parts(cell, split)
+    out[i] = areas_of_parts(wp.vec3d(lo), wp.vec3d(hi), wp.vec3d(plane[0], plane[1], plane[2]), plane[3])
 
 
 def areas(lo, hi, planes):

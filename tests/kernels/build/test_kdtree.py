@@ -14,7 +14,7 @@ from wrt.accel.cells.common import bounds_of
 from wrt.accel.cells.trees import KdOptions
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.planes import KD_LEAF as LEAF
+from wrt.kernels.traverse.plane_layouts import KD_LEAF as LEAF
 from wrt.kernels.traverse.planes import STACK_SIZE
 from wrt.scene.shapes import icosphere, torus
 

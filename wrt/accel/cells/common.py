@@ -23,7 +23,7 @@ from wrt.kernels.build import cells as kernels
 from wrt.kernels.build.cell_splits import RULES
 from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
-from wrt.kernels.traverse.planes import LEAF, BspNode
+from wrt.kernels.traverse.plane_layouts import LEAF, BspNode
 from wrt.kernels.warp_private import fields_of
 
 # Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.

@@ -26,6 +26,7 @@ from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.core.types import WarpStruct
 from wrt.kernels.build.cells import Cell, CellOptions
+from wrt.kernels.traverse import plane_layouts as layouts
 from wrt.kernels.traverse import planes as kernels
 from wrt.kernels.units.box import PAD_EXTENT, half_area
 
@@ -81,14 +82,14 @@ class KdTree(OneMesh):
                           self.threads)
         if max(len(tree.nodes), len(tree.order)) >= MAX_INDEX or tree.nodes["count"].max() > MAX_IN_LEAF:
             raise InputError(f"a k-d tree of {len(tree.order)} references is too large", hint="lower max_growth or max_depth")
-        leaf, nodes = tree.nodes["axis"] == kernels.LEAF, records(kernels.KdNode, len(tree.nodes))
+        leaf, nodes = tree.nodes["axis"] == layouts.LEAF, records(layouts.KdNode, len(tree.nodes))
         nodes["split"] = np.where(leaf, tree.nodes["count"], -tree.nodes["offset"])
-        nodes["word"] = 4 * tree.nodes["first"] + np.where(leaf, kernels.KD_LEAF, tree.nodes["axis"])
+        nodes["word"] = 4 * tree.nodes["first"] + np.where(leaf, layouts.KD_LEAF, tree.nodes["axis"])
         return tree.built(box_arrays(bounds) | {"nodes": nodes})
 
     def _check(self, built: Built) -> None:
         nodes = one_row(self, built)["nodes"]
-        leaf, first = (nodes["word"] & 3) == kernels.KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
+        leaf, first = (nodes["word"] & 3) == layouts.KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
         check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
                    kernels.STACK_SIZE)
         first, count = first[leaf], nodes["split"][leaf].astype(np.float64)
@@ -141,8 +142,8 @@ class Bsp(OneMesh):
 
     def _check(self, built: Built) -> None:
         nodes = one_row(self, built)["nodes"]
-        leaf = nodes["axis"] == kernels.LEAF
-        if ((nodes["axis"] < 0) | (nodes["axis"] > kernels.LEAF) | ~leaf & (nodes["count"] < 1) | ~leaf & (nodes["count"] > 3)).any():
+        leaf = nodes["axis"] == layouts.LEAF
+        if ((nodes["axis"] < 0) | (nodes["axis"] > layouts.LEAF) | ~leaf & (nodes["count"] < 1) | ~leaf & (nodes["count"] > 3)).any():
             raise InputError("is damaged: a node's axis or count is out of range")
         check_children(nodes["first"][~leaf], nodes["count"][~leaf], np.flatnonzero(~leaf), len(nodes), kernels.STACK_SIZE)
         first, count = nodes["first"][leaf].astype(np.int64), nodes["count"][leaf].astype(np.int64)
@@ -155,13 +156,13 @@ class OctreeOptions:
     """Options of the octree. Raises InputError for values out of range."""
 
     max_leaf: int = 8  # Cells of so many primitives or fewer are not split.
-    max_depth: int = kernels.MAX_LEVELS  # Levels below the root, 0 to MAX_LEVELS.
+    max_depth: int = layouts.MAX_LEVELS  # Levels below the root, 0 to MAX_LEVELS.
     by_cost: bool = True  # Do not split a cell whose octants cost a ray as much as the cell.
     max_growth: float = 16.0  # Limit of references per primitive in every part of the tree.
     mailbox: bool = True  # Avoid testing a ray against the same primitive in several cells.
 
     def __post_init__(self) -> None:
-        require_between(max_leaf=(self.max_leaf, 1, 1 << 20), max_depth=(self.max_depth, 0, kernels.MAX_LEVELS),
+        require_between(max_leaf=(self.max_leaf, 1, 1 << 20), max_depth=(self.max_depth, 0, layouts.MAX_LEVELS),
                         max_growth=(self.max_growth, 1.0, 1e4))
 
 
@@ -181,9 +182,9 @@ class Octree(OneMesh):
         chosen.max_leaf, chosen.max_depth, chosen.by_cost = options.max_leaf, layout.levels, options.by_cost
         chosen.layout, chosen.leaf_visit = layout, 1
         tree = build_tree("octree", shapes_of(self.geometry, bounds), root_of(bounds, options.max_growth), chosen, self.threads)
-        nodes = records(kernels.OctreeNode, len(tree.nodes))
+        nodes = records(layouts.OctreeNode, len(tree.nodes))
         nodes["first"] = tree.nodes["first"]
-        nodes["count"] = np.where(tree.nodes["axis"] == kernels.LEAF, 1, -1) * tree.nodes["count"]
+        nodes["count"] = np.where(tree.nodes["axis"] == layouts.LEAF, 1, -1) * tree.nodes["count"]
         arrays = {"size": np.array(layout.size, np.float32), "levels": np.array(layout.levels, np.int32), "nodes": nodes,
                   "mailbox": np.array(options.mailbox, np.int32), "references": tree.order}
         return tree.built(box_arrays(bounds) | arrays, np.arange(n, dtype=np.int32))
@@ -193,7 +194,7 @@ class Octree(OneMesh):
         levels, lo, hi, nodes = int(arrays["levels"]), arrays["lo"], arrays["hi"], arrays["nodes"]
         if not (arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
             raise InputError("is damaged: extent or mailbox is out of range")
-        if not 0 <= levels <= kernels.MAX_LEVELS or (levels and not (lo + np.float32(1 << levels) * arrays["size"] >= hi).all()):
+        if not 0 <= levels <= layouts.MAX_LEVELS or (levels and not (lo + np.float32(1 << levels) * arrays["size"] >= hi).all()):
             raise InputError("is damaged: its cells are not in order")
         if (nodes["count"] < -0xFF).any():
             raise InputError("is damaged: the count of a node is out of range")
@@ -219,7 +220,7 @@ def root_of(bounds: tuple[np.ndarray, np.ndarray], max_growth: float, spare: int
 
 def octree_layout(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
     """Choose the OctreeLayout of boxes lo, hi (N, 3): a cube from their lowest corner on, clipped at their highest corner."""
-    layout = kernels.OctreeLayout()
+    layout = layouts.OctreeLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     layout.lo, layout.hi, layout.size, layout.levels = wp.vec3(*low), wp.vec3(*high), 0.0, 0
     edge = float((high.astype(np.float64) - low).max())

@@ -7,7 +7,7 @@ import numpy as np
 from wrt.accel.cells.trees import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.planes import KD_LEAF
+from wrt.kernels.traverse.plane_layouts import KD_LEAF
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import counters_of
 from wrt.lab.claims.claim import SAME_SCENE, Claim, Figure, Study

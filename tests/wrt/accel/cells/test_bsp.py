@@ -16,7 +16,8 @@ from wrt.accel.cells import common
 from wrt.accel.cells.trees import Bsp
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.traverse.planes import LEAF, PLANE, STACK_SIZE
+from wrt.kernels.traverse.plane_layouts import LEAF, PLANE
+from wrt.kernels.traverse.planes import STACK_SIZE
 from wrt.scene.shapes import icosphere
 
 
