@@ -1,11 +1,11 @@
-"""The command `build`, which builds an acceleration structure and saves it in a file."""
+"""The commands that do slow work in advance: `build` saves an acceleration structure, `compile` fills the kernel cache."""
 
 import time
 from pathlib import Path
 
 import click
 
-from wrt.cli.common import Assignments, Setting, progress_writer, say, say_json, shared, values_of, warnings_reported
+from wrt.cli.common import Assignments, Setting, load, naming, progress_writer, say, say_json, shared, values_of, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
@@ -45,3 +45,28 @@ def build(mesh: Path, output: Path, accel: str, assignments: Assignments, thread
     if not quiet:
         say(repr(structure))
     say(output, err=False)
+
+
+@click.command("compile", help="Fill Warp's kernel cache (WARP_CACHE_PATH) in advance. It gets the kernels that"
+               " query a structure, and the kernels that render SCENES with all AOVs. Kernels already in the cache are skipped.")
+@click.argument("scenes", nargs=-1, type=click.Path(path_type=Path))
+@shared("accel", "device", "threads", "quiet", "as_json")
+def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: int | None, quiet: bool, as_json: bool) -> None:
+    from wrt.core.threads import thread_count
+    from wrt.renderer.prepare import compile_picture, compile_queries
+
+    count, done = thread_count(threads), list[dict[str, object]]()
+
+    def report(purpose: str, names: list[str], begin: float) -> None:
+        done.append({"for": purpose, "kernels": names, "seconds": time.perf_counter() - begin})
+        if not as_json:
+            say(f"{purpose}: {len(names)} kernels, {time.perf_counter() - begin:.1f} s", err=False)
+
+    begin = time.perf_counter()
+    report(f"queries of {accel}", compile_queries(accel, device), begin)
+    for path in scenes:
+        begin, scene = time.perf_counter(), load(path, quiet)
+        with warnings_reported(quiet), naming(path):
+            report(str(path), compile_picture(scene, accel, device, count), begin)
+    if as_json:
+        say_json({"compiled": done})

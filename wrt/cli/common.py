@@ -11,7 +11,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -19,6 +19,8 @@ import click
 
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.settings import DEFAULT_DEVICE
+from wrt.scene.kinds import forms
+from wrt.scene.settings import MAX_DEPTH, SETTINGS, Settings
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -92,17 +94,19 @@ class Commands(click.Group):
 
 
 class OneOf(click.ParamType):
-    """A name in a table, such as an acceleration structure. place: the table as "module:TABLE".
+    """A name in a table, such as an acceleration structure. place: the table, or "module:TABLE", which --help imports.
 
     This type lists the names for --help and completion. It does not check them: the function that receives the name does."""
 
     name = "NAME"
 
-    def __init__(self, place: str) -> None:
+    def __init__(self, place: str | Sequence[str]) -> None:
         self.place = place
 
     def names(self) -> list[str]:
-        """Import the table's module and return the table's names."""
+        """Return the table's names."""
+        if not isinstance(self.place, str):
+            return list(self.place)
         module, table = self.place.split(":")
         return list(getattr(importlib.import_module(module), table))
 
@@ -147,25 +151,33 @@ def quiet_option(text: str) -> Decorator:
     return click.option("-q", "--quiet", is_flag=True, help=text, callback=silence)
 
 
+def setting(name: str, more: str = "") -> Decorator:
+    """Return the option that changes a setting of the scene. The field of Settings gives its type and help, which ends with `more`."""
+    described = forms(Settings)[name].metadata
+    types = {"whole": int, "number": float, "size": SIZE, "choice": OneOf(described["limits"].get("among", ()))}
+    about, unit = described["about"], f" in {described['unit']}" if described["unit"] in ("pixels", "stops") else ""
+    return click.option(f"--{name.replace('_', '-')}", name, type=EXPOSURE if name == "exposure" else types[described["form"]],
+                        help=f"{about[:1].upper()}{about[1:]}{unit}{more}  [default: the scene's]")
+
+
 # Options and arguments that several commands share, by the name of the command function's parameter.
 SHARED: dict[str, Decorator] = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
-    "spp": click.option("--spp", type=int, help="Samples per pixel  [default: the scene's]"),
-    "size": click.option("--size", type=SIZE, help="Width and height in pixels, or a width, which keeps the scene's aspect ratio"
-                         "  [default: the scene's, or 640x360]"),
-    "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, or 8; 64 with glass]"),
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
     "camera": click.option("--camera", help="Name or index of a camera in the scene  [default: the first]"),
     "assignments": click.option(
         "--set", "assignments", type=Setting(), multiple=True,
-        help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
-             " min_throughput, clamp, filter, fresnel, glass_shadows, sampler, exposure, tonemap and auto_exposure (docs/scene_format.md)"),
+        help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are"
+             f" {', '.join(SETTINGS)} (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
     "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
     "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
     "quiet": quiet_option("Print no progress and no warnings"),
     "as_json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON"),
+    **{name: setting(name) for name in ("spp", "max_depth", "min_throughput", "clamp", "filter", "fresnel", "sampler", "tonemap")},
+    "size": setting("size", ", or a width, which keeps the scene's aspect ratio"),
+    "exposure": setting("exposure", ", or auto: bright parts are shown just below white"),
 }
 
 
@@ -212,14 +224,18 @@ def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
     return values
 
 
-def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = None, **reserved: str) -> "SettingChanges":
-    """Return changes of the scene's settings from --set and from `flags`, the values of options such as --spp by setting (None: absent).
+def settings_of(assignments: Assignments, options: dict[str, Parsed] | None = None, **reserved: str) -> "SettingChanges":
+    """Return changes of the scene's settings from --set, and from options such as --spp, which are removed from `options` (None: absent).
 
     reserved: see values_of. Raises InputError for an invalid setting, and if --set and an option give different values."""
     from wrt.core.checks import as_size
     from wrt.io.toml.report import check_settings
 
-    flags = {name: value for name, value in (flags or {}).items() if value is not None}
+    options = options or {}
+    flags = {name: options.pop(name) for name in SETTINGS if name in options}
+    if flags.get("exposure") == "auto":
+        flags |= {"exposure": None, "auto_exposure": True}
+    flags = {name: value for name, value in flags.items() if value is not None}
     values = values_of(assignments, **reserved)
     if "size" in values:
         values["size"] = list(as_size(values["size"], "--set size"))
@@ -233,7 +249,6 @@ def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = N
 def depth_hint(stats: dict[str, Any], max_depth: int, option: str = "--max-depth ") -> str | None:
     """Return advice on max_depth, or None if few pixels are visibly too dark. stats: Film.stats."""
     from wrt.renderer.film import FEW
-    from wrt.scene.settings import MAX_DEPTH
 
     if stats["visibly_cut"] < FEW:
         return None

@@ -25,7 +25,7 @@ def inspect(scene: Path, output: Path | None, assignments: Assignments, quiet: b
 
     if output is not None:
         check_writable(require_drawable(output))
-    settings = settings_of(assignments, {name: options.pop(name) for name in ("spp", "size", "max_depth")})
+    settings = settings_of(assignments, options)
     loaded = load(scene, quiet)
     with warnings_reported(quiet), naming(scene):
         found = inspect_pixel(loaded, **settings, **options)

@@ -1,13 +1,11 @@
-"""The command `render`, which makes a picture; its checkpoint, and a second folder for a picture that cannot be written to the first."""
+"""The commands that make pictures: `render`, with its checkpoint, and `animate`, which makes frames or an animated picture."""
 
 import contextlib
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +14,6 @@ import click
 from wrt.cli.common import (
     CLUSTER,
     DURATION,
-    EXPOSURE,
     STAGING,
     Assignments,
     Names,
@@ -54,22 +51,13 @@ WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 @click.option("--device", default=DEFAULT_DEVICE, show_default=True,
               help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
 @CLUSTER
-@shared("threads", "crop", "camera", "max_depth")
-@click.option("--min-throughput", type=float, help="Cut rays whose throughput is below this  [default: the scene's, or 0.001]")
-@click.option("--clamp", type=float, help="Largest radiance of a sample, against sparks; the loss is reported; 0: no limit"
-              "  [default: the scene's, or 0]")
-@click.option("--filter", "filter_name", type=OneOf("wrt.scene.settings:FILTERS"), help="Pixel filter  [default: the scene's]")
-@click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="Fresnel reflectance: exact, or schlick (cheaper, approximate)")
-@click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="Sample points: sobol (evenly spread), or independent (random)")
-@shared("assignments", "accel")
+@shared("threads", "crop", "camera", "max_depth", "min_throughput", "clamp", "filter", "fresnel", "sampler", "assignments", "accel")
 @STAGING
 @click.option("--instancing", type=OneOf("wrt.accel.scenes.instancing:INSTANCING"), default="auto", show_default=True,
               help="Store a mesh that several objects share once: auto (large meshes), always or never")
 @click.option("--aov", type=Names(), default=(), help="Layers to write as well: depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="Bits per channel. PNG: 8 or 16, EXR: 16 or 32  [default: 8 for PNG, 32 for EXR]")
-@click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), help="Curve from linear to display values  [default: the scene's]")
-@click.option("--exposure", type=EXPOSURE,
-              help="Exposure in stops, or auto: bright parts are shown just below white  [default: the scene's]")
+@shared("tonemap", "exposure")
 @click.option("--time-limit", type=DURATION, help="Stop tracing after this time (30s, 5m, 1h) and write the picture so far")
 @click.option("--target-error", type=float,
               help="Stop when the estimated noise is at most this: the root mean square, over pixels and channels, of the"
@@ -148,8 +136,11 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
     with warnings_reported(quiet):
         film = trace(loaded, scene, settings.get("spp"), options, quiet)
         begin = time.perf_counter()
-        paths, signals, write_error = write_to_stdout(film, bits) if output == STDOUT else save_film(film, output, bits, layers)
-    if checkpoint is not None and not (write_error or film.stats["interrupted"] or film.stats["timed_out"]):
+        with held_interrupts() as signals:
+            paths = [] if output == STDOUT else film.save(output, bits=bits, aov=layers)
+            if output == STDOUT:
+                write_to_stdout(film, bits)
+    if checkpoint is not None and not (film.stats["interrupted"] or film.stats["timed_out"]):
         remove_checkpoint(checkpoint)  # the picture is complete
         film.stats["checkpoint"] = None
     if signals:
@@ -164,8 +155,6 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
         say(f"depth picture: white is {ends['white']:.4g}, the darkest grey {ends['darkest']:.4g}, linear between, in scene units")
     if not quiet:
         say(_summary(film, loaded.settings.auto_exposure))
-    if write_error:
-        raise InputError(f"{write_error}; the picture was written to {paths[0]} instead")
     if film.stats["interrupted"]:
         raise SystemExit(exit_code(film.stats["signal"]))
 
@@ -186,12 +175,7 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     from wrt.renderer.options import Options
     from wrt.scene.model import Scene
 
-    flags = {"filter": options.pop("filter_name")}
-    flags |= {name: options.pop(name) for name in (
-        "spp", "size", "max_depth", "min_throughput", "clamp", "fresnel", "sampler", "tonemap", "exposure")}
-    if flags["exposure"] == "auto":
-        flags |= {"exposure": None, "auto_exposure": True}
-    settings = settings_of(assignments, flags)
+    settings = settings_of(assignments, options)
     options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
     Scene().with_settings(**settings)
     options |= device_options(options.pop("cluster"), options.pop("device"))
@@ -258,34 +242,13 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
     return {"checkpoint": file, "checkpoint_every": EVERY if every is None else every, "resume": resume}
 
 
-def save_film(film: "Film", output: Path, bits: int | None, layers: Sequence[str] | None
-              ) -> tuple[list[Path], list[int], InputError | None]:
-    """Write the picture to `output`. If that fails, write it to a new folder wrt-* in the folder for temporary files (TMPDIR).
-
-    Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if writing to `output` failed. Raises
-    InputError if both folders fail."""
-    with held_interrupts() as signals:
-        try:
-            return film.save(output, bits=bits, aov=layers), signals, None
-        except InputError as error:
-            with contextlib.suppress(OSError, InputError):
-                folder = Path(tempfile.mkdtemp(prefix="wrt-"))
-                try:
-                    return film.save(folder / output.name, bits=bits, aov=layers), signals, error
-                except InputError:
-                    shutil.rmtree(folder, ignore_errors=True)
-            raise
-
-
-def write_to_stdout(film: "Film", bits: int | None) -> tuple[list[Path], list[int], InputError | None]:
-    """Write the picture to stdout as a PNG file. The result is that of save_film, without paths."""
+def write_to_stdout(film: "Film", bits: int | None) -> None:
+    """Write the picture to stdout as a PNG file."""
     from wrt.picture.image import encode_png
     from wrt.picture.tonemap import to_codes
 
     codes = to_codes(film.pixels, film.exposure, film.tonemap, bits or 8)
-    with held_interrupts() as signals:
-        click.echo(encode_png(codes, film.metadata), nl=False)
-    return [], signals, None
+    click.echo(encode_png(codes, film.metadata), nl=False)
 
 
 def remove_checkpoint(path: Path) -> None:
@@ -297,3 +260,57 @@ def remove_checkpoint(path: Path) -> None:
     except OSError as error:
         raise InputError(f"cannot be removed: {error.strerror}",
                          path=path, hint="remove this checkpoint by hand; the picture is finished") from error
+
+
+@click.command()
+@shared("scene")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path),
+              help="A folder for PNG frames, or one file: .gif, .png or .apng (an animated PNG)")
+@click.option("--frames", type=int, default=36, show_default=True, help="Number of frames")
+@click.option("--degrees", type=float, help="Orbit of the camera in degrees  [default: 360, or 0 if an object moves]")
+@click.option("--fps", type=float, default=24.0, show_default=True, help="Frames per second of a .gif, .png or .apng file")
+@click.option("--rebuild-at", type=float, default=1.5, show_default=True,
+              help="Rebuild the acceleration structure, instead of refitting it, once its SAH cost has grown by this factor")
+@shared("spp", "size", "assignments", "seed", "device", "threads", "camera", "accel", "quiet", "as_json")
+def animate(scene: Path, output: Path, fps: float, assignments: Assignments, quiet: bool, as_json: bool,
+            **options: Parsed) -> None:
+    """Render an animation of SCENE. It is a turntable, or the motion of its objects (`motion` and `morph` in TOML)."""
+    from wrt.renderer import animate as animation
+    from wrt.renderer.options import Options
+
+    if not 0.1 <= fps <= 100.0:
+        raise InputError(f"must be 0.1 to 100, got {fps:g}", argument="fps")
+    plan = animation.Animation(*(options.pop(name) for name in ("frames", "degrees", "rebuild_at")))
+    settings = settings_of(assignments, options)
+    rendering = Options(**options)
+    target = animation.check_output(output)
+    loaded = load(scene, quiet).with_settings(**settings)
+    pictures, rows, signal, darkest = [], [], None, {"visibly_cut": 0.0}
+    begin = time.perf_counter()
+    with warnings_reported(quiet), naming(scene):
+        for film in animation.animate(loaded, plan, rendering):
+            if film.stats["interrupted"]:
+                signal = film.stats["signal"]
+                break
+            row = film.stats["frame"] | {"trace": film.stats["seconds"]["trace"]}
+            rows.append(row)
+            darkest = max(darkest, film.stats, key=lambda stats: stats["visibly_cut"])
+            if target.is_dir():
+                film.save(animation.frame_path(target, row["number"], plan.frames))
+            else:
+                pictures.append(film.to_srgb8())
+            if not quiet:
+                say(f"frame {row['number'] + 1} of {plan.frames}: structure {row['structure']} in {row['seconds']:.3f} s,"
+                    f" traced in {row['trace']:.2f} s")
+    if pictures:
+        animation.save_movie(target, pictures, fps)
+    if as_json:
+        say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
+    elif rows:
+        say(target, err=False)
+    hint = depth_hint(darkest, loaded.settings.max_depth, "--set max_depth=")
+    if hint and not quiet:
+        say(hint)
+    if len(rows) < plan.frames:
+        say(f"interrupted after {len(rows)} of {plan.frames} frames")
+        raise SystemExit(exit_code(signal))

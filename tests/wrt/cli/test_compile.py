@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from tests.data import ROOT
 from tests.device import NAME
-from wrt.cli.compile import compile_kernels
+from wrt.cli.build import compile_kernels
 
 
 def test_the_command_reports_the_compiled_kernels() -> None:

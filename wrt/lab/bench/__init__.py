@@ -12,7 +12,7 @@ THREAD_CHOICES = ("one", "all", "both")
 
 @dataclass(frozen=True)
 class Queries(Plan):
-    """Compare CONTESTANTS on the same rays: build time, memory, steps a ray, speed, and the answers that differ.
+    """Compare CONTESTANTS on the same rays. Measure build time, memory, steps a ray, speed, and the answers that differ.
 
     A contestant is a structure of wrt or another library, with options after colons: bvh8, bvh2:builder=sweep, bvh8:triangle=plane,
     grid:density=4, embree, embree:mode=fast, warp, open3d, trimesh. Times and answers relate to the first one. Default: all structures
