@@ -19,7 +19,7 @@ from typing import NamedTuple
 from tests.data import ROOT
 from tests.sanitize import shading
 from tests.sanitize.cases import write_cases
-from wrt.kernels.shade import headers as shading_headers
+from wrt.kernels.loops import state
 from wrt.kernels.wide.layout import LAYOUT_H
 
 HERE = Path(__file__).parent
@@ -42,7 +42,7 @@ class Program(NamedTuple):
 
 PROGRAMS = (
     Program("walks.cpp", "wide", LAYOUT_H, write_cases),
-    Program("shading.cpp", "shade", shading_headers.LAYOUT_H, shading.write_cases),
+    Program("shading.cpp", "shade", state.LAYOUT_H, shading.write_cases),
 )
 
 
