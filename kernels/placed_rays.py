@@ -44,8 +44,6 @@ class HitPoints64:
 
     origins: wp.array(dtype=wp.vec3d)  # By ray, as directions.
     directions: wp.array(dtype=wp.vec3d)
-    vertices: wp.array(dtype=wp.vec3d)
-    faces: wp.array(dtype=wp.vec3i)
     ray: wp.array(dtype=wp.int64)
     face: wp.array(dtype=wp.int64)
     u: wp.array(dtype=wp.float32)
@@ -132,7 +130,7 @@ def split_rays(rays: SplitRays, first: int):
 
 
 @kernel
-def locate_hits(hits: HitPoints64, first: int):
+def locate_hits(vertices: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), hits: HitPoints64, first: int):
     """Compute where rays hit the planes of their triangles, in float64 (Moeller, Trumbore 1997).
 
     A ray that misses its triangle in float64 has the point at the u and v from float32. Where a direction is 0, the coordinate is the
@@ -140,10 +138,10 @@ def locate_hits(hits: HitPoints64, first: int):
     """
     i = first + wp.tid()
     ray = hits.ray[i]
-    face = hits.faces[hits.face[i]]
-    corner = hits.vertices[face[0]]
-    e = hits.vertices[face[1]] - corner
-    f = hits.vertices[face[2]] - corner
+    face = faces[hits.face[i]]
+    corner = vertices[face[0]]
+    e = vertices[face[1]] - corner
+    f = vertices[face[2]] - corner
     s = hits.origins[ray] - corner
     p = wp.cross(hits.directions[ray], f)
     q = wp.cross(s, e)

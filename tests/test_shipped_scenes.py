@@ -13,7 +13,7 @@ import warp as wp
 
 import wrt
 from tests.data import ROOT
-from wrt.accel.queries.all_hits import list_hits
+from wrt.accel.queries.lists import list_hits
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.snapshot import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
@@ -113,7 +113,7 @@ def test_the_other_kernels_compile_for_turing_and_one_for_hopper(tmp_path: Path)
                 for name in ("bvh", "brute_force") for make in (closest_hit_kernel, any_hit_kernel)]
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(triangle=name))) for name in RAY_TRIANGLE]
     kernels += [closest_hit_kernel(Structure(ACCELERATORS["bvh"], Units(box=name))) for name in RAY_AABB]
-    kernels.append(list_hits(Structure(ACCELERATORS["bvh"]), True).kernel)
+    kernels.append(list_hits(Structure(ACCELERATORS["bvh"]), True))
     for i, kernel in enumerate(kernels):
         archs = [75] if i else [75, 90]
         assert len(wp.compile_aot_module(kernel.module, arch=archs, module_dir=tmp_path)) == len(archs)

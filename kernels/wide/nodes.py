@@ -126,14 +126,18 @@ def make_plain(width: int, compressed: bool) -> Any:
     return children, entry
 
 
-@cache
-def make_native(width: int, compressed: bool) -> Any:
-    """Return children (see make_children) in C++, for the CPU only."""
-    row = row_type(width)
+def node_type(width: int, compressed: bool) -> str:
+    """Return the C++ definition of `node`, the node at nodes[first] (box.h), for functions in C++."""
     numbers = {"COMPRESSED": int(compressed), "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
                "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
     layout = ", ".join(f"{name} = {value}" for name, value in numbers.items())
-    node = f"struct Layout {{ enum {{ {layout} }}; }}; const wrt::Node<{width}, Layout> node = {{nodes.data + (long long)first}};"
+    return f"struct Layout {{ enum {{ {layout} }}; }}; const wrt::Node<{width}, Layout> node = {{nodes.data + (long long)first}};"
+
+
+@cache
+def make_native(width: int, compressed: bool) -> Any:
+    """Return children (see make_children) in C++, for the CPU only."""
+    row, node = row_type(width), node_type(width, compressed)
 
     @wp.func_native(lanes_only(f"""
     {node}

@@ -6,13 +6,11 @@ from fractions import Fraction
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.raw_kernel import RawKernel
-from wrt.compat.given_rays import RayFormat
-from wrt.core.warp_private import record_of, struct_record
-from wrt.kernels.placed_rays import FAR, HitPoints64, PlacedRays, Placement, SplitRays, locate_hits, place_rays, split_rays
+from wrt.accel.queries.raw_launches import RowKernel
+from wrt.core.warp_private import array_record, record_of
+from wrt.kernels.placed_rays import FAR, Placement, locate_hits, place_rays, split_rays
 
-PLACE, LOCATE = RayFormat(place_rays, PlacedRays, (3, 3), np.float64, Placement()), RawKernel(locate_hits, HitPoints64())
-SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32)
+PLACE, LOCATE, SPLIT = RowKernel(place_rays, 2), RowKernel(locate_hits, 6), RowKernel(split_rays, 1)
 ODD = [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, -1e-300, 5e-324, 1e37, 2e37, 1.0]
 
 
@@ -21,10 +19,10 @@ def placed(origins, directions, *, shift=(0.0, 0.0, 0.0), exponent=0, center=(0.
     place = Placement()
     place.shift, place.center, place.radius, place.near = wp.vec3d(*shift), wp.vec3d(*center), radius, 4.0 * radius
     place.scale, place.scale_again = 2.0 ** (exponent // 2), 2.0 ** (exponent - exponent // 2)
-    rays = PLACE.converted((origins, directions), threads, record_of(place))
-    valid = rays.t_max == np.inf
-    assert (rays.t_max[~valid] == -np.inf).all()
-    return rays.origins, rays.directions, valid
+    origins, directions, t_max = PLACE.rows(len(origins), (origins, directions), record_of(place), threads=threads)
+    valid = t_max == np.inf
+    assert (t_max[~valid] == -np.inf).all()
+    return origins, directions, valid
 
 
 def random_rays(n, seed):
@@ -104,26 +102,26 @@ def test_points_are_where_the_lines_meet_the_planes():
     targets = np.einsum("nk,nkj->nj", weights, corners)
     origins = rng.normal(size=(200, 3))
     faces = np.arange(600, dtype=np.int32).reshape(-1, 3)
-    arrays = (origins, targets - origins, corners.reshape(-1, 3), faces, np.arange(200), np.arange(200),
-              weights[:, 1].astype(np.float32), weights[:, 2].astype(np.float32), np.empty((200, 3)))
-    LOCATE.launch(200, struct_record(HitPoints64, arrays))
-    expected = np.array([exact_point(*row) for row in zip(corners, origins, targets - origins, strict=True)])
-    np.testing.assert_allclose(arrays[-1], expected, rtol=0.0, atol=1e-11)
+    ways, vertices = targets - origins, corners.reshape(-1, 3)
+    hits = np.arange(200), np.arange(200), weights[:, 1].astype(np.float32), weights[:, 2].astype(np.float32)
+
+    def located(ways):
+        return LOCATE.rows(200, (origins, ways, *hits), array_record(vertices), array_record(faces))[0]
+
+    expected = np.array([exact_point(*row) for row in zip(corners, origins, ways, strict=True)])
+    np.testing.assert_allclose(located(ways), expected, rtol=0.0, atol=1e-11)
     # Lines that miss in float64, and lines in the plane, have the point at u and v.
-    beside = (origins, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), *arrays[2:-1], np.empty((200, 3)))
-    nowhere = np.full((200, 3), np.nan)
-    LOCATE.launch(200, struct_record(HitPoints64, (origins, nowhere, *beside[2:])))
-    np.testing.assert_allclose(beside[-1], targets, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(located(np.full((200, 3), np.nan)), targets, rtol=0.0, atol=1e-6)
 
 
 def test_rows_of_six_are_split_and_checked():
     odd = np.array([0.0, np.nan, np.inf, 1e37, 1.1e37, -3e38, 1.0], np.float32)
     rows = np.array(np.meshgrid(*[odd] * 2, [0.0, 1.0, np.nan, -1e-45], [0.0, -np.inf], [0.0], [2.0, 0.0], indexing="ij"), np.float32)
     rows = np.ascontiguousarray(rows.reshape(6, -1).T)
-    rays = SPLIT.converted((rows,), 1)
+    origins, directions, t_max = SPLIT.rows(len(rows), (rows,))
     finite = np.isfinite(rows).all(axis=1)
     far = finite & (np.abs(np.where(finite[:, None], rows[:, :3], 0.0)) > np.float32(1e37)).any(axis=1)
     valid = finite & ~far & rows[:, 3:].any(axis=1)
-    np.testing.assert_array_equal(rays.t_max, np.where(far, FAR, np.where(valid, np.inf, -np.inf)))
-    np.testing.assert_array_equal(np.concatenate([rays.origins, rays.directions], axis=1)[valid], rows[valid])
-    assert np.isfinite(rays.origins).all() and rays.directions.any(axis=1).all()  # a query accepts all rays
+    np.testing.assert_array_equal(t_max, np.where(far, FAR, np.where(valid, np.inf, -np.inf)))
+    np.testing.assert_array_equal(np.concatenate([origins, directions], axis=1)[valid], rows[valid])
+    assert np.isfinite(origins).all() and directions.any(axis=1).all()  # a query accepts all rays

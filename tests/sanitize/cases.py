@@ -11,8 +11,8 @@ import numpy as np
 from tests.kernel_tools import DEVICE, floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
-from wrt.accel.queries.all_hits import ALL, list_hits
 from wrt.accel.queries.hit_points import device_scene
+from wrt.accel.queries.lists import ALL, list_hits
 from wrt.accel.scenes.build import build
 from wrt.accel.snapshot import any_hit_kernel, closest_hit_kernel
 from wrt.kernels.hit_lists import HitLists
@@ -64,7 +64,7 @@ def counts(accel: Any, rays: RayArrays, n: int, crossings: bool) -> np.ndarray:
     lists.first = wp.array(np.arange(n + 1), dtype=wp.int32, device=DEVICE)
     lists.count, lists.rows = zeros(n, wp.int32), zeros(n, Hit)
     if n > 0:
-        launch(list_hits(accel.structure, False).kernel, n, accel.data, rays, lists, 0)
+        launch(list_hits(accel.structure, False), n, accel.data, rays, lists, 0)
     return np.maximum(lists.count.numpy(), 0)
 
 

@@ -155,7 +155,7 @@ def test_lists_of_hits_in_several_parts_equal_those_of_the_cpu(monkeypatch: pyte
     mesh, rng = shapes.icosphere(2), np.random.default_rng(0)
     origins = 2.0 * rng.normal(size=(1000, 3))
     directions = 0.5 * rng.normal(size=(1000, 3)) - origins  # towards points in the ball
-    monkeypatch.setattr("wrt.accel.queries.all_hits.RAYS_AT_ONCE", 300)
+    monkeypatch.setattr("wrt.accel.queries.all_hits.BATCH_ON_GPU", 300)
     there, here = (wrt.all_hits(wrt.build(mesh, device=name), origins, directions) for name in ("cuda:0", "cpu"))
     for field in ("first", "t", "u", "v", "prim_id"):
         assert np.array_equal(to_numpy(getattr(there, field)), getattr(here, field))

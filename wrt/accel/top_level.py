@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
+from wrt.accel.bvh.tree import BvhOptions, half_areas
 from wrt.accel.geometry import Geometry, InstancedGeometry, inverse_of, spread_of
-from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import empty_aligned, on_host, records, start, upload
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.traverse.instances import Placement
@@ -56,43 +55,18 @@ class TopLevel:
 
 def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) -> TopLevel:
     """Build the trees over the boxes of all instances."""
-    from wrt.kernels.build.fit import NO_PARENT  # builders are imported when they are needed: most scenes have no instances
+    from wrt.accel.bvh.top_down import build_forest  # builders are imported when they are needed: most scenes have no instances
+    from wrt.kernels.build.fit import NO_PARENT
 
-    first = geometry.first_instance
-    nodes, order, roots, depth = split_worlds(low, high, first)
+    forest, roots = build_forest("binned", low, high, geometry.first_instance, BvhOptions(max_leaf=1))
+    nodes, order = forest.nodes, forest.order
     parents = np.full(len(nodes), NO_PARENT, np.int32)
     for side in "01":
         inner = np.flatnonzero((nodes["count_" + side] == 0) & (nodes["first_" + side] > 0))
         parents[nodes["first_" + side][inner]] = inner
     rows = np.arange(len(order))
-    top = TopLevel(nodes, roots, parents, order, depth, low, high, np.empty(len(order)), records(Placement, len(order)))
+    top = TopLevel(nodes, roots, parents, order, forest.depth, low, high, np.empty(len(order)), records(Placement, len(order)))
     return write_placements(top, geometry, rows)
-
-
-def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world; return nodes, order, roots, depth."""
-    from wrt.accel.bvh.top_down import build_data, build_options, in_order
-    from wrt.kernels.build.bvh2 import SPLIT, make_build_ranges
-    from wrt.kernels.build.records import BuildTask
-
-    count = np.diff(first)
-    # A tree has as many slots for nodes as it has boxes, at least one.
-    slot = np.cumsum([0, *np.maximum(count, 1)])
-    nodes = records(Bvh2Node, int(slot[-1]))
-    used = np.zeros(len(nodes), np.uint8)
-    for side in "01":
-        nodes["lo_" + side], nodes["hi_" + side] = np.inf, -np.inf
-    used[slot[:-1][count < 2]] = 1
-    alone, many = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
-    for name, value in (("lo_0", low[first[alone]]), ("hi_0", high[first[alone]]), ("first_0", first[alone]), ("count_0", 1)):
-        nodes[name][slot[alone]] = value
-    tasks = records(BuildTask, len(many))
-    tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
-    build, (depth, none) = in_order(low, high), np.zeros((2, 1), np.int32)
-    launch_raw(make_build_ranges(SPLIT["binned"]), len(tasks), build_data(records=build, nodes=nodes, used=used),
-               tasks, build_options(BvhOptions(max_leaf=1)), 0, records(BuildTask, 1), none, depth)
-    roots = (np.cumsum(used != 0) - 1)[slot[:-1]].astype(np.int32)
-    return squeeze(nodes, used != 0), build["prim_id"].copy(), roots, int(depth[0]) + 1
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:

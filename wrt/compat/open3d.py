@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
-from functools import partial
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -17,22 +16,24 @@ from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.few_lists import begins
-from wrt.accel.queries.rays import vectors
-from wrt.compat.given_rays import RayFormat
+from wrt.accel.queries.lists import begins
+from wrt.accel.queries.raw_launches import RowKernel
+from wrt.accel.queries.rays import constant, vectors
 from wrt.compat.joined_meshes import JoinedMeshes
-from wrt.compat.surfaces import every_hit, hit_counts, scatter
+from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
-from wrt.kernels.placed_rays import SplitRays, split_rays
+from wrt.kernels.placed_rays import FAR, split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number, type_of
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
+SPLIT_RAYS = RowKernel(split_rays, 1)
+FAR_AWAY = np.float32(FAR)  # a constant of Warp would make NumPy compare objects one by one
 
 
 class Array(np.ndarray):
@@ -119,8 +120,10 @@ class RaycastingScene:
         """
         scene = self._scene()
         shape, rows = _rows(rays, "rays", 6, scene.origin)
-        t, u, v, prim_id = SPLIT.closest_hits(scene.accel, (rows,), _threads(nthreads))
-        return _answers({"t_hit": t, **scene.found(prim_id, u, v), "primitive_normals": scene.normals.take(prim_id, 0)}, shape)
+        threads = _threads(nthreads)
+        hits = scene.accel.closest_hit(*_split(rows, threads), threads)
+        return _answers({"t_hit": hits.t, **scene.found(hits.prim_id, hits.u, hits.v),
+                         "primitive_normals": scene.normals.take(hits.prim_id, 0)}, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
         """Test whether each ray hits anything: (...) bool.
@@ -132,21 +135,21 @@ class RaycastingScene:
         """
         threads, scene = _threads(nthreads), self._scene()
         accel, (shape, rows) = scene.accel, _rows(rays, "rays", 6, scene.origin)
+        origins, directions, t_min, t_max = _split(rows, threads)
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
-            return _answer(SPLIT.any_hits(accel, (rows,), threads), shape)
+            return _answer(accel.any_hit(origins, directions, t_min, t_max, threads), shape)
         near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
-        far = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
-        hit = SPLIT.any_hits(accel, (rows,), threads, ends=(np.fmax(near, np.float32(0.0)), far))
+        end = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
+        hit = accel.any_hit(origins, directions, np.fmax(near, np.float32(0.0)), np.minimum(t_max, end), threads)
         if (near < 0.0).any():
-            behind = np.zeros_like(near), np.where(far >= 0.0, -near, far)
-            hit |= SPLIT.any_hits(accel, (rows * np.array([1, 1, 1, -1, -1, -1], np.float32),), threads, ends=behind)
+            hit |= accel.any_hit(origins, -directions, t_min, np.minimum(t_max, np.where(end >= 0.0, -near, end)), threads)
         return _answer(hit, shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
         threads, scene = _threads(nthreads), self._scene()
         shape, rows = _rows(rays, "rays", 6, scene.origin)
-        return _answer(hit_counts(scene.accel, SPLIT, (rows,), threads).astype(np.int32), shape)
+        return _answer(hit_counts(scene.accel, _split(rows, threads), threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -159,7 +162,7 @@ class RaycastingScene:
         """
         scene, threads = self._scene(), _threads(nthreads)
         rows = _rows(rays, "rays", 6, scene.origin)[1]
-        ray, face, t, u, v = every_hit(scene.accel, SPLIT.converted((rows,), threads), threads)
+        ray, face, t, u, v = every_hit(scene.accel, _split(rows, threads), threads)
         splits = begins(np.bincount(ray, minlength=len(rows)))
         return _answers({"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
                          **scene.found(face, u, v)})
@@ -296,7 +299,12 @@ def _finite(array: np.ndarray, name: str) -> np.ndarray:
     return valid
 
 
-SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32, refuse=partial(_finite, name="rays"))
+def _split(rows: np.ndarray, threads: int) -> NumpyRays:
+    """Return the rays of rows of six. Rays that hit nothing have t_max = -inf. Raises InputError for origins beyond FARTHEST."""
+    origins, directions, t_max = SPLIT_RAYS.rows(len(rows), (rows,), threads=threads)
+    if np.count_nonzero(t_max == FAR_AWAY):
+        _finite(rows, "rays")
+    return origins, directions, constant(0.0, len(rows)), t_max
 
 
 def _answers(found: dict[str, np.ndarray], shape: tuple[int, ...] | None = None) -> dict[str, Answer]:

@@ -1,25 +1,29 @@
 """All hits of rays, counted as in other libraries: a ray through an edge or a corner of a surface hits the surface once."""
 
+from typing import TypeAlias
+
 import numpy as np
 
 from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
 from wrt.accel.queries.answers import Hits
-from wrt.compat.given_rays import GivenRays, RayFormat
+from wrt.accel.queries.rays import Rays
+
+NumpyRays: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # origins, directions, t_min and t_max, as in Rays
 
 
-def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
-    """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` per ray.
+def every_hit(accel: Accelerator, rays: NumpyRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
+    """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` per ray. rays: see ListQuery.of_valid.
 
     A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first touched face. If
     the mesh is closed, that ray hits up to two touched faces, the nearest ones, as entry and exit.
     """
-    query = ListQuery(accel, threads, crossings=True).of_valid(rays.rays)
+    query = ListQuery(accel, threads, crossings=True).of_valid(Rays(*rays))
     crossed = query.all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
     if len(rest := np.flatnonzero(query.touches)):
-        touched = _touched(accel, rays.of(rest), threads)
+        touched = _touched(accel, Rays(*rays).of(rest), threads)
         row, column = np.nonzero(touched.prim_id >= 0)
         more = rest[row], *(array[row, column] for array in (touched.prim_id, touched.t, touched.u, touched.v))
         found = [np.concatenate(pair) for pair in zip(found, more, strict=True)]
@@ -28,24 +32,18 @@ def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = AL
     return tuple(found)
 
 
-def hit_counts(accel: Accelerator, form: RayFormat, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
-    """Return the number of hits of each ray in `every_hit`, (N,) of integers. arrays, inputs: see RayFormat.converted."""
-    counts = form.few_counts(accel.snapshot, arrays, *inputs)
-    if counts is not None:
-        rest = np.flatnonzero(counts < 0)
-    else:
-        query = ListQuery(accel, threads, crossings=True).of_valid(form.converted(arrays, threads, *inputs).rays)
-        counts, rest = query.counts(), np.flatnonzero(query.touches)
-    if len(rest):
-        rays = form.converted(tuple(array[rest] for array in arrays), threads, *inputs)
-        counts[rest] = (_touched(accel, rays, threads).prim_id >= 0).sum(axis=1)
+def hit_counts(accel: Accelerator, rays: NumpyRays, threads: int) -> np.ndarray:
+    """Return the number of hits of each ray in `every_hit`, (N,) int64."""
+    query = ListQuery(accel, threads, crossings=True).of_valid(Rays(*rays))
+    counts = query.counts()
+    if len(rest := np.flatnonzero(query.touches)):
+        counts[rest] = (_touched(accel, Rays(*rays).of(rest), threads).prim_id >= 0).sum(axis=1)
     return counts
 
 
-def _touched(accel: Accelerator, rays: GivenRays, threads: int) -> Hits[np.ndarray]:
+def _touched(accel: Accelerator, rays: Rays, threads: int) -> Hits[np.ndarray]:
     """Return the hits of rays that only touch faces, (N, 1) or (N, 2)."""
-    origins, directions, t_max = rays
-    return first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, origins, directions, t_max=t_max, threads=threads)
+    return first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, *rays, threads=threads)
 
 
 def scatter(found: np.ndarray, valid: np.ndarray | None, missing: object) -> np.ndarray:

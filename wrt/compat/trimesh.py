@@ -14,19 +14,18 @@ import warp as wp
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.points.enclosing import enclosing
-from wrt.accel.queries.batches import SMALL
-from wrt.accel.queries.raw_kernel import RawKernel
-from wrt.accel.queries.raw_launches import raw_launch
+from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.raw_launches import RowKernel
+from wrt.accel.queries.rays import constant
 from wrt.accel.scenes.build import build
-from wrt.compat.given_rays import RayFormat
-from wrt.compat.surfaces import every_hit, hit_counts
+from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
-from wrt.core.threads import FreeList, thread_count
+from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, WarpStruct
-from wrt.core.warp_private import array_record, record_of, struct_record
-from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
+from wrt.core.warp_private import array_record, record_of
+from wrt.kernels.placed_rays import Placement, locate_hits, place_rays
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh
 
@@ -40,8 +39,7 @@ if TYPE_CHECKING:
 
 MAX_HITS = 100  # of a ray, by default, as in trimesh
 FAR = 4.0  # in radii of a mesh: an origin farther from the mesh is moved near it before it is rounded to float32
-PLACED = RayFormat(place_rays, PlacedRays, (3, 3), np.float64, Placement())
-LOCATE_HITS = RawKernel(locate_hits, HitPoints64())
+PLACE_RAYS, LOCATE_HITS = RowKernel(place_rays, 2), RowKernel(locate_hits, 6)
 
 
 class RayMeshIntersector:
@@ -115,12 +113,12 @@ class RayMeshIntersector:
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
         scaled = self.scaled
-        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions))[3])
+        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions)).prim_id)
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
         scaled = self.scaled
-        return PLACED.any_hits(scaled.accel, _rays(ray_origins, ray_directions), scaled.threads, scaled.placement)
+        return scaled.accel.any_hit(*scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool; False for points that are not finite.
@@ -173,6 +171,7 @@ class _ScaledStructure:
         self.source = None if np.array_equal(self.faces, local.faces) else np.append(source, -1)
         self.accel = build(local if self.source is None else Mesh(local.vertices, self.faces), device=device, threads=threads)
         self.threads, self.vertices = thread_count(threads), vertices
+        self.mesh = array_record(self.vertices), array_record(self.faces)
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         place: WarpStruct = Placement()
@@ -193,30 +192,30 @@ class _ScaledStructure:
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
 
-    def closest_hits(self, *rays: np.ndarray) -> list[np.ndarray]:
-        """Return t, u, v and prim_id of the closest hit of each ray. rays: origins and directions."""
-        return PLACED.closest_hits(self.accel, rays, self.threads, self.placement)
+    def placed(self, origins: np.ndarray, directions: np.ndarray) -> NumpyRays:
+        """Move and scale rays to the place of the structure, and round them to float32."""
+        n = len(origins)
+        origins, directions, t_max = PLACE_RAYS.rows(n, (origins, directions), self.placement, threads=self.threads)
+        return origins, directions, constant(0.0, n), t_max
+
+    def closest_hits(self, *rays: np.ndarray) -> Hits[np.ndarray]:
+        """Return the closest hit of each ray. rays: origins and directions."""
+        return self.accel.closest_hit(*self.placed(*rays), self.threads)
 
     def first_hit(self, *rays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        _, u, v, prim_id = self.closest_hits(*rays)
-        hit = np.flatnonzero(prim_id >= 0)
-        return hit, prim_id[hit].astype(np.int64), u[hit], v[hit]
+        hits = self.closest_hits(*rays)
+        hit = np.flatnonzero(hits.prim_id >= 0)
+        return hit, hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
-        rays = PLACED.converted((origins, directions), self.threads, self.placement)
-        ray, face, _, u, v = every_hit(self.accel, rays, self.threads, limit)
+        ray, face, _, u, v = every_hit(self.accel, self.placed(origins, directions), self.threads, limit)
         return ray, face.astype(np.int64), u, v
 
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
-        if max(len(origins), len(hits[0])) <= SMALL:
-            return FEW_LOCATIONS.run(lambda few: few.located((self.vertices, self.faces), (origins, directions, *hits)))
-        points = np.empty((len(hits[0]), 3))
-        arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
-        LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
-        return points
+        return LOCATE_HITS.rows(len(hits[0]), (origins, directions, *hits), *self.mesh, threads=self.threads)[0]
 
     def face_at(self, point: np.ndarray, reach: float) -> int:
         """Return a face with area at a distance of at most `reach` from a point (3,), computed in float64; -1 if there is none."""
@@ -231,31 +230,6 @@ class _ScaledStructure:
         return contains(self.accel, self.to_local(points), threads=self.threads)
 
 
-class _FewLocations:
-    """Buffers for SMALL hits of SMALL rays, and a recorded launch that locates them. One thread uses it at a time."""
-
-    def __init__(self) -> None:
-        origins, directions, self.points = np.empty((3, SMALL, 3))
-        ray, face = np.empty((2, SMALL), np.int64)
-        u, v = np.empty((2, SMALL), np.float32)
-        self.buffers: list[np.ndarray] = [origins, directions, ray, face, u, v]
-        self.record = struct_record(HitPoints64, (origins, directions, None, None, ray, face, u, v, self.points))
-        self.launch = raw_launch(locate_hits, HitPoints64(), 0)
-
-    def located(self, mesh: tuple[np.ndarray, np.ndarray], rays_and_hits: tuple[np.ndarray, ...]) -> np.ndarray:
-        """Return points as `_ScaledStructure.located`. mesh: vertices and faces."""
-        for buffer, array in zip(self.buffers, rays_and_hits, strict=True):
-            buffer[:len(array)] = array
-        self.record.vertices, self.record.faces = map(array_record, mesh)
-        self.launch.set(0, self.record)
-        self.launch.set_dim(n := len(rays_and_hits[-1]))
-        self.launch.launch()
-        return self.points[:n].copy()
-
-
-FEW_LOCATIONS = FreeList(_FewLocations)
-
-
 class _Counter(NamedTuple):
     """The part of a ray class that trimesh's contains_points uses: it only counts the hits of each ray."""
 
@@ -266,7 +240,7 @@ class _Counter(NamedTuple):
                             multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
         """Return the ray of each hit, (M,) int64, in the second place."""
         scaled = self.scaled
-        counts = np.minimum(hit_counts(enclosing(scaled.accel), PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
+        counts = np.minimum(hit_counts(enclosing(scaled.accel), scaled.placed(origins, directions), scaled.threads), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 

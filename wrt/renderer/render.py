@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from wrt.accel.base import OneMesh
-from wrt.accel.bvh.small import SMALL
+from wrt.accel.bvh.wide import SMALL
 from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build

@@ -8,7 +8,7 @@ import numpy as np
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import preloading, records
 from wrt.core.warp_private import struct_record
 from wrt.kernels.build import reinsertion as kernels

@@ -7,7 +7,7 @@ import numpy as np
 
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import load_kernel, record_dtype, records, start
 from wrt.core.threads import run_growing
 from wrt.core.types import Kernel, WarpStruct
@@ -30,13 +30,18 @@ def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> Binar
 
 def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Build by full-sweep SAH: try every split of a range by centroid, along all three axes."""
-    lo, hi = geometry.bounds(threads)
-    center = 0.5 * lo + 0.5 * hi
-    n = len(lo)
-    build = in_order(lo, hi)
-    order = np.concatenate([np.argsort(center[:, axis], kind="stable") for axis in range(3)]).astype(np.int32)
-    return split_ranges("sweep", build, options, threads, boxes=build.copy(), order=order, area=np.empty(n, np.float32),
-                        left=np.empty(n, np.uint8), scratch=np.empty(n, np.int32))
+    build = in_order(*geometry.bounds(threads))
+    return split_ranges("sweep", build, options, threads, **sweep_arrays(build, np.zeros(len(build), np.int32)))
+
+
+def sweep_arrays(build: np.ndarray, tree: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the fields of BuildData that only the full sweep reads. build: BuildRecords; tree: ascending index of each record's tree."""
+    n = len(build)
+    with np.errstate(invalid="ignore"):  # NaN, and boxes of all space
+        center = 0.5 * build["lo"] + 0.5 * build["hi"]
+    order = np.concatenate([np.lexsort((center[:, axis], tree)) for axis in range(3)]).astype(np.int32)
+    return {"boxes": build.copy(), "order": order, "area": np.empty(n, np.float32), "left": np.empty(n, np.uint8),
+            "scratch": np.empty(n, np.int32)}
 
 
 def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
@@ -68,6 +73,47 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     data = build_data(records=build, nodes=nodes, used=used, **arrays)
     depth = run_tasks(build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder]), data, build_options(options), n, threads)
     return BinaryTree(squeeze(nodes, used != 0), build["prim_id"].copy(), depth)
+
+
+def build_forest(builder: str, low: np.ndarray, high: np.ndarray, first: np.ndarray, options: BvhOptions) -> tuple[BinaryTree, np.ndarray]:
+    """Build a tree over each range of boxes first[i] .. first[i + 1] - 1, all of them in one launch.
+
+    Return the trees one after another, of which BinaryTree.depth is the largest depth, and the index of each root, (T,) int32.
+    """
+    count = np.diff(first)
+    # A tree has as many slots for nodes as it has boxes, at least one.
+    slot = np.cumsum([0, *np.maximum(count, 1)])
+    nodes = records(Bvh2Node, int(slot[-1]))
+    used = np.zeros(len(nodes), np.uint8)
+    for side in "01":
+        nodes["lo_" + side], nodes["hi_" + side] = np.inf, -np.inf
+    used[slot[:-1][count < 2]] = 1
+    alone, many = np.flatnonzero(count == 1), np.flatnonzero(count > 1)
+    for name, value in (("lo_0", low[first[alone]]), ("hi_0", high[first[alone]]), ("first_0", first[alone]), ("count_0", 1)):
+        nodes[name][slot[alone]] = value
+    tasks = records(build_records.BuildTask, len(many))
+    tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
+    build, (depth, none) = in_order(low, high), np.zeros((2, 1), np.int32)
+    arrays = sweep_arrays(build, np.repeat(np.arange(len(count)), count)) if builder == "sweep" else {}
+    data, kernel = build_data(records=build, nodes=nodes, used=used, **arrays), build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder])
+    launch_raw(kernel, len(tasks), data, tasks, build_options(options), 0, records(build_records.BuildTask, 1), none, depth)
+    roots = (np.cumsum(used != 0) - 1)[slot[:-1]].astype(np.int32)
+    return BinaryTree(squeeze(nodes, used != 0), build["prim_id"].copy(), int(depth[0]) + 1), roots
+
+
+def build_few(boxes: list[tuple[np.ndarray, np.ndarray]], options: BvhOptions) -> list[BinaryTree]:
+    """Build a tree by full-sweep SAH over each pair of boxes lo, hi (n, 3) float32, with two boxes or more."""
+    if not boxes:
+        return []
+    first = np.cumsum([0, *(len(lo) for lo, _ in boxes)])
+    low, high = (np.concatenate(ends) for ends in zip(*boxes, strict=True))
+    forest, roots = build_forest("sweep", low, high, first, options)
+    nodes, begin = forest.nodes, np.append(roots, len(forest.nodes))
+    for side in "01":
+        leaf = nodes["count_" + side] > 0
+        nodes["first_" + side] -= np.where(leaf, np.repeat(first[:-1], np.diff(begin)), np.repeat(roots, np.diff(begin))).astype(np.int32)
+    return [BinaryTree(nodes[begin[i]:begin[i + 1]].copy(), forest.order[first[i]:first[i + 1]] - np.int32(first[i]), forest.depth)
+            for i in range(len(boxes))]
 
 
 def build_options(options: BvhOptions) -> WarpStruct:

@@ -14,11 +14,22 @@ from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, INNER, BoxTree
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
-from wrt.accel.bvh.small import SMALL, small_tree, small_trees
-from wrt.accel.bvh.tree import binary_tree_of
-from wrt.accel.bvh.wide_tree import WideTree, check_wide, collapse, collapse_kernels, lanes_of, packed, refit, row_starts, wide_tree_of
+from wrt.accel.bvh.top_down import build_few
+from wrt.accel.bvh.tree import BinaryTree, binary_tree_of
+from wrt.accel.bvh.wide_tree import (
+    WideTree,
+    check_wide,
+    collapse,
+    collapse_kernels,
+    lanes_of,
+    one_leaf,
+    packed,
+    refit,
+    row_starts,
+    wide_tree_of,
+)
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.accel.queries.raw_launches import launch_raw
 from wrt.accel.snapshot import Built
 from wrt.core.building import report, report_parts
 from wrt.core.device import aligned, empty_aligned, preloading, record_dtype, start
@@ -31,6 +42,7 @@ from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
+SMALL = 128  # primitives: so few trees are built in one launch, and without reinsertion, which gains nothing there
 BINARY = 0.8  # share of a build's time after which the binary tree is finished, for large meshes
 ROWS_BY_KERNEL = 1 << 15  # triangles
 
@@ -74,15 +86,20 @@ class CollapsedBvh(OneMesh):
     def _tree(self, built: Built) -> WideTree:
         """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
 
-    def _collapsed(self, options: BvhOptions, *kernels: Kernel) -> WideTree:
-        """Build a binary tree and collapse it; load `kernels`, which the structure needs afterwards, at the same time."""
-        # Two leaves count as cheaper than one if they have less area, because the cost of inner nodes depends on the collapse.
-        of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
+    @classmethod
+    def _of_binary(cls, options: BvhOptions) -> BvhOptions:
+        """Return the options of the binary tree. Two leaves count as cheaper than one if they have less area, because the cost of inner
+        nodes depends on the collapse."""
+        return replace(options, max_leaf=min(options.max_leaf, cls.width), cost_traversal=0.0, cost_intersection=1.0)
+
+    def _collapsed(self, options: BvhOptions, *kernels: Kernel, binary: BinaryTree | None = None) -> WideTree:
+        """Build a binary tree, unless it is given, and collapse it; load `kernels`, which the structure needs afterwards, meanwhile."""
         with preloading(*(collapse_kernels() if len(self.geometry) > 1 else ()), *kernels):
-            binary = build_binary(self.geometry, of_binary, self.threads)
+            if binary is None:
+                binary = build_binary(self.geometry, self._of_binary(options), self.threads)
             report(BINARY)
             if len(binary.order) < 2:
-                return small_tree(*self.geometry.bounds(), options)
+                return one_leaf(*self.geometry.bounds(), self.width)
             tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
         if self.compressed and len(binary.order) > MAX_FIRST:
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}",
@@ -127,15 +144,15 @@ class WideBvh(CollapsedBvh):
     @classmethod
     def build_all(cls, structures: Sequence[Self], options: BinaryOptions) -> list[Built]:
         options = BvhOptions(**asdict(options), row=cls.width)
-        few = [each for each in structures if options.builder == "refined" and len(each.geometry) <= SMALL]
-        trees = dict(zip(map(id, few), small_trees([each.geometry.bounds() for each in few], options), strict=True))
+        few = [each for each in structures if options.builder == "refined" and 2 <= len(each.geometry) <= SMALL]
+        with preloading(*collapse_kernels() if few else ()):
+            binary = build_few([each.geometry.bounds() for each in few], cls._of_binary(options))
+        trees = dict(zip(map(id, few), binary, strict=True))
         return report_parts(structures, lambda each: each._built(trees.get(id(each)), options))
 
-    def _built(self, tree: WideTree | None, options: BvhOptions) -> Built:
-        """Return the arrays of a tree. Build the tree if it is None, or too deep."""
-        kernels = [rows_kernel()] if self._rows_by_kernel() else []
-        if tree is None or tree.stack > STACK_SIZE:
-            tree = self._collapsed(options, *kernels)
+    def _built(self, binary: BinaryTree | None, options: BvhOptions) -> Built:
+        """Return the arrays of the tree over a binary tree, which is built if it is None."""
+        tree = self._collapsed(options, *([rows_kernel()] if self._rows_by_kernel() else []), binary=binary)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 

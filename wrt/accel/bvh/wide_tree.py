@@ -8,7 +8,7 @@ import warp as wp
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.bvh.tree import BinaryTree, expected_cost, half_areas
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
 from wrt.core.types import Kernel
@@ -47,6 +47,17 @@ class WideTree:
     def sah_cost(self, root: float) -> float:
         """Return the SAH cost. root: half the surface area of the root's box."""
         return expected_cost(root, self.areas, np.where(self.children < 0, leaf_count.func(self.children), 0))
+
+
+def one_leaf(lo: np.ndarray, hi: np.ndarray, width: int) -> WideTree:
+    """Return the tree over no box or one box. lo, hi: (0 or 1, 3) float32."""
+    n = len(lo)
+    low, high = (np.full((1, width, 3), end, np.float32) for end in (np.inf, -np.inf))
+    children, order = np.full((1, width), EMPTY, np.int32), np.full((n, width), -1, np.int32)
+    if n:
+        low[0, -1], high[0, -1] = lo[0], hi[0]
+        children[0, -1], order[0, 0] = leaf_reference.func(0, 1), 0
+    return WideTree(low, high, children, order, n, 1, 0)
 
 
 def leaf_rows(references: np.ndarray) -> np.ndarray:

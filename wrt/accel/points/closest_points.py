@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,23 +14,22 @@ from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import HitIds, Source, device_scene
 from wrt.accel.queries.part_faces import part_faces
-from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
+from wrt.accel.queries.raw_launches import RowKernel
 from wrt.accel.queries.rays import to_origin
 from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.queries.world_ids import check_world, roots_at
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
-from wrt.core.device import upload
+from wrt.core.device import launch_on, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike, KernelModule, WarpStruct
+from wrt.core.types import ArrayLike, Kernel, KernelModule, WarpStruct
 from wrt.kernels.warp_private import fields_of
-from wrt.kernels.wide.closest_placed import PointPlaces, make_placed_points_kernel
-from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel
+from wrt.kernels.wide.closest_points import PointRows, PointSurfaces, make_closest_points_kernel
+from wrt.kernels.wide.layout import NodeLayout
 from wrt.kernels.wide.traverse import WideTraversal
 
 POINTS_PER_LAUNCH = 4096
-POINT_KINDS = [field.dtype for field in fields_of(PointArrays).values()]
 SIGNS = ("crossings", "winding")
 
 
@@ -105,36 +103,54 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     origin = snapshot.geometry.origin
-    (rows, shape, world), device = shaped_points(points, world, origin), snapshot.device
-    n, memory, worlds = len(rows), kernel_memory(device), check_world(snapshot, world, len(rows))
-    roots = roots_at(snapshot, worlds, n)
-    out: list[Any] = [memory.empty(n, kind) for kind in POINT_KINDS]
-    points_and_roots: list[Any] = [memory.array(rows, wp.vec3)]
-    if roots is None:
-        kernel, scene = make_closest_point_kernel(kernels.layout), device_scene(snapshot).surfaces
+    rows, shape, world = shaped_points(points, world, origin)
+    worlds = check_world(snapshot, world, len(rows))
+    roots = roots_at(snapshot, worlds, len(rows))
+    kernel, surfaces = rows_kernel(kernels.layout, roots is not None), point_surfaces(snapshot)
+    given = rows, np.zeros(len(rows), np.int32) if roots is None else roots
+    if snapshot.device.is_cpu:
+        out = kernel.rows(len(rows), given, snapshot.data, surfaces, threads=thread_count(threads))
     else:
-        kernel, scene = make_placed_points_kernel(kernels.layout), point_places(snapshot)
-        points_and_roots.append(memory.array(roots, wp.int32))
-    memory.launch(RawKernel(kernel, step=POINTS_PER_LAUNCH), n, snapshot.data, scene, *points_and_roots,
-                  memory.struct(PointArrays, *out), threads=thread_count(threads))
-    found = ClosestPoints(*[*(in_shape(memory.numpy(array), shape) for array in out), (snapshot, None, worlds)])
+        out = _on_gpu(kernel.kernel, snapshot, surfaces, given)
+    found = ClosestPoints(*[*(in_shape(array, shape) for array in out), (snapshot, None, worlds)])
     return found if origin is None else replace(found, point=found.point + origin)
 
 
+@made_once
+def rows_kernel(layout: NodeLayout, instances: bool) -> RowKernel:
+    return RowKernel(make_closest_points_kernel(layout, instances), 2, POINTS_PER_LAUNCH)
+
+
+def _on_gpu(kernel: Kernel, snapshot: Snapshot, surfaces: WarpStruct, given: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
+    """Run the kernel on a GPU as RowKernel.rows."""
+    device, rows = snapshot.device, PointRows()
+    kinds = {name: field.dtype for name, field in fields_of(PointRows).items()}
+    for (name, kind), values in zip(kinds.items(), given, strict=False):
+        setattr(rows, name, upload(values, kind, device))
+    out = {name: wp.empty(len(given[0]), dtype=kind, device=device) for name, kind in [*kinds.items()][len(given):]}
+    for name, array in out.items():
+        setattr(rows, name, array)
+    launch_on(device, kernel, len(given[0]), snapshot.data, surfaces, rows, 0)
+    return [array.numpy() for array in out.values()]
+
+
 @once
-def point_places(snapshot: Snapshot) -> WarpStruct:
-    """Upload what closest points need of placements: kernels.wide.closest_placed.PointPlaces."""
-    geometry, device, places = snapshot.geometry, snapshot.device, PointPlaces()
-    assert isinstance(geometry, InstancedGeometry)
+def point_surfaces(snapshot: Snapshot) -> WarpStruct:
+    """Return kernels.wide.closest_points.PointSurfaces of a structure."""
+    geometry, device, out = snapshot.geometry, snapshot.device, PointSurfaces()
+    if not isinstance(geometry, InstancedGeometry):
+        surfaces = device_scene(snapshot).surfaces
+        out.vertices, out.faces = surfaces.vertices, surfaces.faces
+        return out
+    out.vertices, out.faces, out.first_face = part_faces(snapshot)
     reach = np.array([np.abs(part.vertices[np.isfinite(part.vertices)]).max(initial=0.0) for part in geometry.parts])
     to_world, part = geometry.to_world[snapshot.order], geometry.part[snapshot.order]
     for row, axis in enumerate("xyz"):
-        setattr(places, f"world_{axis}", upload(to_world[:, row], wp.vec4d, device))
+        setattr(out, f"world_{axis}", upload(to_world[:, row], wp.vec4d, device))
     least = np.linalg.svd(to_world[:, :, :3], compute_uv=False)[:, -1]
     corners = np.abs(to_world[:, :, :3]).sum(axis=2).max(axis=1) * reach[part] + np.abs(to_world[:, :, 3]).max(axis=1)
-    places.least, places.margin = upload(least, wp.float64, device), upload(2.0**-22 * corners, wp.float64, device)
-    places.vertices, places.faces, places.first_face = part_faces(snapshot)
-    return places
+    out.least, out.margin = upload(least, wp.float64, device), upload(2.0**-22 * corners, wp.float64, device)
+    return out
 
 
 def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None, *, sign: str = "crossings",

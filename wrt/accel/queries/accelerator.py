@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypedDict, Unpack, overload
 
 import numpy as np
@@ -16,7 +17,7 @@ from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.observed import counted
 from wrt.accel.queries.rays import are_rows, rays_of
-from wrt.accel.queries.shapes import flat_arrays, in_shape, shaped_rays, worlds_of_each
+from wrt.accel.queries.shapes import Shape, flat_arrays, in_shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.tiles import tiled_width
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import AccelStats, Snapshot, Structure, check_units
@@ -182,27 +183,20 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        snapshot = self.snapshot  # read once, because a refit may replace it during the query
-        threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
-        if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
-            rays = rays_of(origins, directions, t_min, t_max, True, snapshot.geometry.origin)  # type: ignore[arg-type]
-        else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid, snapshot.geometry.origin)
-            callers, world = callers and flat_arrays(callers, shape, HIT_TYPES), worlds_of_each(world, shape)
-        give = to_tensor_like(origins, directions)
-        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
-                                             give is not None)
-        worlds = check_world(snapshot, world, len(t))
-        query, counters = Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0), None
+        snapshot = self.snapshot  # read once, because a refit may replace it during the query
+        query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), True, threads,
+                                    None if out is None else arrays_of(out), world, invalid)
+        counters = None
         if costs and any(costs.values()):
             counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
         else:
             trace_query(snapshot, query)
-        hits = Hits(t, u, v, prim_id, counters, (snapshot, rays, worlds))
+        t, u, v, prim_id = query.out
+        hits: Hits[Any] = Hits(t, u, v, prim_id, counters, (snapshot, query.rays, query.worlds))
         if recording_tape() is not None:
-            record(hits, t=t, u=u, v=v)
+            record(hits, t=hits.t, u=hits.u, v=hits.v)
         hits = hits if shape is None else hits.in_shape(shape)
         return hits if give is None else hits.each(give)
 
@@ -239,22 +233,36 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        snapshot, shape, callers = self.snapshot, None, None if out is None else [out]
-        threads, world, invalid = thread_count(threads), None, "raise"
         if options:
             check_keywords("any_hit", options, ANY_HIT)
-            world, invalid = options.get("world"), options.get("invalid", invalid)
-        if are_rows(origins, directions) and invalid == "raise":
-            rays = rays_of(origins, directions, t_min, t_max, origin=snapshot.geometry.origin)  # type: ignore[arg-type]
-        else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid, origin=snapshot.geometry.origin)
-            callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
-        give = to_tensor_like(origins, directions)
-        arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
-        worlds = check_world(snapshot, world, len(arrays[0]))
-        trace_query(snapshot, Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0))
-        found = arrays[0] if shape is None else in_shape(arrays[0], shape)
+        snapshot = self.snapshot
+        query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), False, threads,
+                                    None if out is None else (out,), **options)
+        trace_query(snapshot, query)
+        found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
+
+
+def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], gradients: bool, threads: int | None,
+           out: Sequence[Any] | None, world: ArrayLike | None = None,
+           invalid: str = "raise") -> tuple[Query, Shape | None, Callable[[Any], Any] | None]:
+    """Return the query of a call, the shape of its results, and the function that converts them to the caller's library.
+
+    Shape and function are None for NumPy arrays (N, 3), the usual call. types: of the results; `rays`: the caller's origins, directions,
+    t_min and t_max; other arguments: see `Accelerator.closest_hit` and `rays_of`.
+    """
+    if threads is not None:
+        threads = thread_count(threads)
+    origin = snapshot.geometry.origin
+    if are_rows(rays[0], rays[1]) and invalid == "raise":
+        valid, shape, give, device = rays_of(*rays, gradients, origin), None, None, None
+    else:
+        valid, shape = shaped_rays(*rays, gradients, invalid, origin)
+        give, device = to_tensor_like(*rays[:2]), snapshot.device if valid.as_warp else None
+        out, world = out and flat_arrays(out, shape, types), worlds_of_each(world, shape)
+    n = len(valid.origins)
+    arrays = answer_arrays(types, out, n, device, give is not None)
+    return Query(valid, arrays, threads, check_world(snapshot, world, n), tiled_width(shape) if shape else 0), shape, give
 
 
 # Keywords of the queries.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -20,9 +20,8 @@ from wrt.core.errors import InputError
 from wrt.core.tables import html_table, write_table
 from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
-HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
-ANY_HIT_TYPES = {"out": np.bool_}
-COUNT_TYPES = {"out.count": np.int32}  # of kernels.hit_lists.HitLists
+HIT_TYPES = {f"out.{name}": np.dtype(np.int32 if name == "prim_id" else np.float32) for name in ("t", "u", "v", "prim_id")}
+ANY_HIT_TYPES = {"out": np.dtype(np.bool_)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,28 +182,32 @@ def arrays_of(out: object) -> list[Any]:
     return [out.t, out.u, out.v, out.prim_id]
 
 
-def answer_arrays(types: Mapping[str, type], out: list[Any] | None, n: int, device: Device | None,
-                  shared: bool = False) -> list[Array]:
+def answer_arrays(types: Mapping[str, np.dtype], out: Sequence[Any] | None, n: int, device: Device | None,
+                  shared: bool = False) -> Sequence[Array]:
     """Return one array (n,) per entry of `types`: checked arrays of `out`, or new ones. device: None for NumPy arrays, else Warp.
 
     shared: begin a new array at a cache line, because JAX would copy any other array. Raises InputError that names the array by its
     key in `types`.
     """
     if out is None:
-        empty = empty_aligned if shared else np.empty
-        return [empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
-                for dtype in types.values()]
-    out = [from_tensor(array, name, None) for name, array in zip(types, out, strict=True)]
+        if device is not None:
+            return [wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device) for dtype in types.values()]
+        return [empty_aligned(n, dtype) if shared else np.empty(n, dtype) for dtype in types.values()]
+    if {*map(type, out)} != {np.ndarray}:
+        out = [from_tensor(array, name, None) for name, array in zip(types, out, strict=True)]
+    alone = device is None and len({*map(id, out)}) == len(out)  # whether no array can share memory with another
     for (name, dtype), array in zip(types.items(), out, strict=True):
         if device is None:
             fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
+            alone = alone and fits and array.base is None
         else:
             fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
                     and (array.is_contiguous or n == 0))
         if not (fits and array.shape == (n,)):
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device} and")
-            raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} contiguous, got {shown(array)}",
-                             argument=name)
+            raise InputError(f"must be a {kind} array ({n},) of {dtype}, {place} contiguous, got {shown(array)}", argument=name)
+    if alone:
+        return out
     # The arrays are contiguous, so that they overlap exactly if their bounds do.
     for (name, one), (other, two) in combinations(zip(types, out, strict=True), 2) if len(out) > 1 else ():
         if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:

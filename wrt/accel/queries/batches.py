@@ -1,13 +1,14 @@
 """Kernel launches of a query, on CPU threads or a GPU. Some structures have a CPU kernel that traces many rays at a time."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.answers import ANY_HIT_TYPES, COUNT_TYPES, HIT_TYPES
-from wrt.accel.queries.raw_launches import raw_launch
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.raw_launches import SMALL, raw_launch
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
 from wrt.accel.queries.world_ids import WorldIds
@@ -15,7 +16,7 @@ from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
-from wrt.core.threads import FreeList, run_all
+from wrt.core.threads import FreeList, run_all, thread_count
 from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.hit_lists import HitLists
@@ -33,19 +34,18 @@ BYTES_OF_RAY = 48  # A ray and its hit.
 FITS_ANY_GPU = 1 << 20  # Up to this number of rays, the free memory of the GPU is not queried.
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range.
 BUFFERED = 16384  # Rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache.
-NO_ROOM = np.zeros(BUFFERED + 1, np.int32)  # HitLists.first, for lists that only count
-SMALL = 1024  # Up to this number of rays, a copy is faster than kernel records of the caller's arrays.
 
 
 class Query(NamedTuple):
     """A call of closest_hit or any_hit.
 
-    out: arrays for the results: t, u, v and prim_id, or one array of bool. width: see tiles.tiled_width.
+    out: arrays for the results: t, u, v and prim_id, or one array of bool. threads: None for one per core. width: see
+    tiles.tiled_width.
     """
 
     rays: Rays
-    out: list[Array]
-    threads: int
+    out: Sequence[Array]
+    threads: int | None
     worlds: WorldIds | None = None
     width: int = 0
 
@@ -53,10 +53,11 @@ class Query(NamedTuple):
 def trace_query(snapshot: Snapshot, query: Query) -> None:
     """Trace the rays and write the results to query.out. Raises InputError for invalid rays, after some results are written."""
     any_hit = len(query.out) == 1
-    if snapshot.device.is_cuda and query.worlds is None:
-        trace_on_gpu(snapshot, query)
-    elif query.worlds is None:
-        tracer(snapshot.structure, any_hit).trace(snapshot, query)
+    if query.worlds is None:
+        if snapshot.device.is_cuda:
+            trace_on_gpu(snapshot, query)
+        else:
+            tracer(snapshot.structure, any_hit).trace(snapshot, query)
     elif snapshot.device.is_cuda or not has_stream(snapshot.structure):
         trace_worlds(snapshot, query, query.worlds)
     else:
@@ -88,34 +89,39 @@ class Tracer:
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
         self.sizes = stream.stream_sizes if self.stream else ()
-        self.types = COUNT_TYPES if structure.units.lists else ANY_HIT_TYPES if any_hit else HIT_TYPES
+        self.types = {} if structure.units.lists else ANY_HIT_TYPES if any_hit else HIT_TYPES
         self.out = HitLists if structure.units.lists else None if any_hit else HitArrays
         self.inputs = structure.struct(), Surfaces(), self.rays(), self.out and self.out()
         self.workers = FreeList(lambda: Worker(self))
 
-    def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], n: int, threads: int) -> None:
-        """Trace n valid rays. packed: kernel records of the rays and of the results. The caller keeps the arrays."""
-        def job(first: int, end: int) -> None:
-            worker = self.workers.take()
-            worker.launch(snapshot, packed, first, end)
-            self.workers.give(worker)
-
-        run_all([partial(job, *each) for each in parts(n, threads, self.block)], threads)
-
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
-        rays, threads = query.rays, query.threads
-        if rays.as_warp or not type(rays.t_min) is type(rays.t_max) is np.ndarray:
+        rays: Rays = query.rays
+        inputs: Any = rays
+        results: Any = query.out
+        if not (type(rays.origins) is type(rays.t_min) is type(rays.t_max) is np.ndarray):
             rays = rays.on(wp.get_device("cpu"))
+            results = [np.asarray(array) for array in results]
         if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
-        inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
-        n = len(inputs[0])
-        is_large = SMALL < n <= MOST_PACKED
-        in_place = is_large and all(map(readable, inputs))
+        if rays is not inputs:
+            inputs = [np.asarray(array) for array in rays]
         if query.worlds is not None:
-            inputs.append(query.worlds.arrays.id.numpy())
-        width = query.width if is_large and self.stream else 0
+            inputs = [*inputs, query.worlds.arrays.id.numpy()]
+        n = len(inputs[0])
+        if n <= SMALL:
+            refused = self.workers.run(lambda worker: worker.trace(snapshot, inputs, results))
+        else:
+            refused = self._trace_many(snapshot, inputs, results, thread_count(query.threads), query.width)
+        if refused:
+            rays.checked()
+
+    def _trace_many(self, snapshot: Snapshot, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray], threads: int,
+                    width: int) -> bool:
+        """Trace in several launches, in place where that is possible. Return whether a ray was refused."""
+        n = len(inputs[0])
+        in_place = n <= MOST_PACKED and all(map(readable, inputs))
+        width = width if n <= MOST_PACKED and self.stream else 0
         packed = pack(self.rays, inputs, results) if in_place and not width else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
@@ -129,26 +135,17 @@ class Tracer:
         def job(first: int, end: int) -> None:
             worker = self.workers.take()
             if packed:
-                worker.launch(snapshot, packed, first, end)
+                refused.append(worker.launch(snapshot, packed, first, end))
             else:
-                worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results], width)
-            refused.append(bool(worker.report[ANY_REFUSED]))
+                refused.append(worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results],
+                                            width))
             self.workers.give(worker)
 
         run_all([partial(job, *each) for each in ranges], threads)
-        if any(refused):
-            rays.checked()
+        return any(refused)
 
 
 tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRays))
-
-
-@made_once
-def lister(structure: Structure) -> Tracer | None:
-    """Return a tracer that lists all hits on the CPU, or None if the structure has no kernel that lists for many rays at a time."""
-    listing = structure._replace(units=structure.units._replace(lists=True))
-    stream: KernelModule = structure.accel.stream
-    return tracer(listing, True) if stream and stream.make_stream(listing.units, True) else None
 
 
 @made_once
@@ -172,13 +169,6 @@ class Worker:
     """
 
     def __init__(self, tracer: Tracer) -> None:
-        self.rays = [np.empty((BUFFERED, 3), np.float32), np.empty((BUFFERED, 3), np.float32), *np.empty((2, BUFFERED), np.float32)]
-        self.results = [np.empty(BUFFERED, dtype) for dtype in tracer.types.values()]
-        if tracer.rays is WorldRays:
-            self.rays.append(np.empty(BUFFERED, np.int32))
-        self.packed = pack(tracer.rays, self.rays, self.results)
-        if tracer.out is HitLists:  # of crossings, without room
-            self.packed = self.packed[0], struct_record(HitLists, [0, True, None, None, None, NO_ROOM, *self.results])
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
@@ -186,9 +176,19 @@ class Worker:
         self.command = raw_launch(tracer.kernel, *tracer.inputs, *own, 0)
         self.inputs: list[object] = [None] * (len(own) + 5)  # of the last launch
         self.own = [record_of(self.scratch)] if tracer.stream else []
+        if not tracer.types:  # the caller has buffers
+            return
+        self.rays = [np.empty((BUFFERED, 3), np.float32), np.empty((BUFFERED, 3), np.float32), *np.empty((2, BUFFERED), np.float32)]
+        self.results = [np.empty(BUFFERED, dtype) for dtype in tracer.types.values()]
+        if tracer.rays is WorldRays:
+            self.rays.append(np.empty(BUFFERED, np.int32))
+        self.packed = pack(tracer.rays, self.rays, self.results)
 
-    def trace(self, snapshot: Snapshot, rays: list[np.ndarray], results: list[np.ndarray], width: int = 0) -> None:
-        """Trace at most BUFFERED rays by means of the buffers, in tiles if `width` is not 0. Values beyond float32 become infinite."""
+    def trace(self, snapshot: Snapshot, rays: Sequence[np.ndarray], results: Sequence[np.ndarray], width: int = 0) -> bool:
+        """Trace at most BUFFERED rays by means of the buffers, in tiles if `width` is not 0. Return whether a ray was refused.
+
+        Values beyond float32 become infinite.
+        """
         n = len(rays[0])
         for target, source in zip(self.rays, rays, strict=True):
             if source.dtype != target.dtype:
@@ -198,15 +198,16 @@ class Worker:
                 copy_to_tiles(target[:n], np.ascontiguousarray(source), width)
             else:
                 target[:n] = source
-        self.launch(snapshot, self.packed, 0, n)
+        refused = self.launch(snapshot, self.packed, 0, n)
         for result, found in zip(results, self.results, strict=True):
             if width:
                 copy_from_tiles(result, found[:n], width)
             else:
                 result[:] = found[:n]
+        return refused
 
-    def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
-        """Trace the rays [first, end) of `packed`, from `pack`. Afterwards report[ANY_REFUSED] tells whether one of them was invalid."""
+    def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> bool:
+        """Trace the rays [first, end) of `packed`, from `pack`. Return whether one of them was refused, because it is invalid."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # a kernel that traces one ray at a time has no argument `end`
             if inputs[i] is not last:
@@ -217,6 +218,7 @@ class Worker:
             self.command.set_dim(threads)
             self.threads = threads
         self.command.launch()
+        return bool(self.report[ANY_REFUSED])
 
 
 def readable(array: np.ndarray) -> bool:
@@ -224,7 +226,7 @@ def readable(array: np.ndarray) -> bool:
     return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
 
 
-def pack(kind: WarpType, rays: list[np.ndarray], results: list[np.ndarray]) -> tuple[Any, Any]:
+def pack(kind: WarpType, rays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> tuple[Any, Any]:
     """Make kernel records of rays (`kind`) and results (HitArrays or an array of bool). The caller must keep the arrays."""
     return struct_record(kind, rays), struct_record(HitArrays, results) if len(results) > 1 else array_record(results[0])
 
@@ -251,10 +253,10 @@ def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
     """Trace each ray in its own world, as trace_query does; on a GPU in one launch."""
     device = snapshot.device
     inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
-    launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, query.threads)
+    launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, thread_count(query.threads))
 
 
-def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: list[Array], threads: int = 1) -> None:
+def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: Sequence[Array], threads: int = 1) -> None:
     """Launch a kernel that traces one ray per thread over all rays, and write the results to `out`."""
     on_device = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
                  else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]

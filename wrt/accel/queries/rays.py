@@ -1,7 +1,8 @@
 """Rays of a query: checks of the caller's arrays, and their conversion for kernels."""
 
 from ctypes import c_float
-from functools import cache
+from functools import cache, lru_cache
+from math import copysign
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbe
 from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpType
-from wrt.core.warp_private import keep
+from wrt.core.warp_private import keep, recording_tape
 from wrt.kernels.query import FARTHEST, RayArrays, add_origin, subtract_origin
 from wrt.kernels.warp_private import fields_of
 
@@ -88,31 +89,29 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
 
     origin: of the structure's geometry; the rays are relative to it. Raises InputError that names the argument.
     """
-    without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
-    check_no_gradients(t_min=t_min, t_max=t_max, **without)
-    rays: list[Any] = [from_tensor(origins, "origins"), from_tensor(directions, "directions")]
-    if any(isinstance(array, wp.array) for array in rays):
-        if isinstance(rays[0], wp.array) and rays[0].dtype in (wp.vec3, wp.vec3d):
-            rays[0] = from_origin(rays[0], origin)
-        if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
+    if recording_tape() is not None:
+        without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
+        check_no_gradients(t_min=t_min, t_max=t_max, **without)
+    o: Any = origins if type(origins) is np.ndarray else from_tensor(origins, "origins")
+    d: Any = directions if type(directions) is np.ndarray else from_tensor(directions, "directions")
+    if isinstance(o, wp.array) or isinstance(d, wp.array):
+        if isinstance(o, wp.array) and o.dtype in (wp.vec3, wp.vec3d):
+            o = from_origin(o, origin)
+        if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (o, d)):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
     else:
-        rays = [from_origin(_rows(rays[0], "origins", "(..., 3)"), origin), _rows(rays[1], "directions", "(..., 3)")]
-    n = len(rays[0])
-    if len(rays[1]) != n:
-        raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")
-    return Rays(rays[0], rays[1], segment_ends(t_min, n, "t_min"), segment_ends(t_max, n, "t_max"))
+        o, d = _rows(o, "origins", "(..., 3)"), _rows(d, "directions", "(..., 3)")
+        o = o if origin is None else o - origin
+    n = len(o)
+    if len(d) != n:
+        raise InputError(f"must have as many rows as origins ({n}), got {len(d)}", argument="directions")
+    return Rays(o, d, segment_ends(t_min, n, "t_min"), segment_ends(t_max, n, "t_max"))
 
 
-def are_rows(origins: Any, directions: Any) -> bool:
-    """Return whether `rays_of` takes both arguments as they are: NumPy arrays (N, 3), the usual case, or Warp arrays (N,)."""
-    if type(origins) is np.ndarray and type(directions) is np.ndarray:
-        return origins.ndim == 2 and origins.shape == directions.shape
-    if isinstance(origins, wp.array):
-        return isinstance(directions, wp.array) and origins.dtype == directions.dtype == wp.vec3 and origins.shape == directions.shape \
-            and origins.ndim == 1
-    mine, other = (getattr(array, "shape", ()) for array in (origins, directions))
-    return len(mine) == 2 and mine == other and not isinstance(directions, wp.array)
+def are_rows(origins: object, directions: object) -> bool:
+    """Return whether both arguments are NumPy arrays of one shape (N, ...), the usual case."""
+    return (type(origins) is np.ndarray and type(directions) is np.ndarray and origins.ndim == 2
+            and origins.shape == directions.shape)
 
 
 def is_valid(origins: np.ndarray, directions: np.ndarray, t_min: np.ndarray, t_max: np.ndarray) -> np.ndarray:
@@ -167,24 +166,30 @@ def segment_ends(value: ArrayLike, n: int, name: str) -> Array:
     """Convert t_min or t_max (`name`) of n rays to an array (n,). Raises InputError for other shapes, and for an invalid number."""
     if type(value) is not float:  # a float, the usual case, needs no conversion
         value = from_tensor(value, name, wp.float32)
-    if isinstance(value, wp.array):
-        if value.dtype != wp.float32 or value.shape != (n,):
-            raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)
-        return value
-    if type(value) is not float:
+        if isinstance(value, wp.array):
+            if value.dtype != wp.float32 or value.shape != (n,):
+                raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)
+            return value
         array = real_numbers(value, name, f"a number or ({n},)")
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
             raise InputError(f"must be a number or ({n},), got {array.shape}", argument=name)
         if array.ndim == 1:
             return array
         value = float(float32(array))
-    _check_ends(c_float(value).value, name)
+    if not value >= LOWEST[name]:
+        _check_ends(c_float(value).value, name)  # float32 rounds tiny negative numbers to 0
     return constant(value, n)
 
 
 def constant(value: float, n: int) -> np.ndarray:
     """Return an array (n,) float32 of stride 0, all of whose elements are `value`. Values beyond float32 become infinite."""
-    return np.ndarray((n,), np.float32, c_float(value), strides=(0,))  # type: ignore[arg-type]
+    return _endless(value, copysign(1.0, value))[:n]
+
+
+@lru_cache(64)
+def _endless(value: float, sign: float) -> np.ndarray:  # the sign keeps 0.0 and -0.0 apart
+    out: np.ndarray = np.ndarray((1 << 60,), np.float32, c_float(value), strides=(0,))  # type: ignore[arg-type]
+    return out
 
 
 def _checked_ends(array: Array, name: str) -> Array:
@@ -205,8 +210,8 @@ def _check_ends(least: float, name: str) -> None:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
 
-def _rows(value: ArrayLike, name: str, form: str = "(N, 3)") -> np.ndarray:
-    array = real_numbers(value, name, form)
+def _rows(value: Any, name: str, form: str = "(N, 3)") -> np.ndarray:
+    array: np.ndarray = value if type(value) is np.ndarray and value.dtype.kind == "f" else real_numbers(value, name, form)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"must be {form}, got {array.shape}", argument=name)
     return array

@@ -17,7 +17,7 @@ from tests.structures import families_first
 from tests.wrt.accel.test_structures_agree import mixed_rays
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.few_lists import MOST
+from wrt.accel.queries.lists import BATCH
 from wrt.accel.scenes.build import build
 from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.common import Units
@@ -116,10 +116,10 @@ def test_thousands_of_hits_in_one_place() -> None:
 
 def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = wrt.Mesh(np.tile(np.float32([[-1, -1, 0], [2, -1, 0], [-1, 2, 0]]), (50, 1)), np.arange(150).reshape(-1, 3))
-    n = MOST + 1
+    n = BATCH + 1
     asked = np.tile(np.float32([0.1, 0.2, 3.0]), (n, 1)), np.tile(np.float32([0.0, 0.0, -1.0]), (n, 1))
     accel = wrt.build(mesh)
-    monkeypatch.setattr("wrt.accel.queries.all_hits.MOST_ROWS", 49 * n)
+    monkeypatch.setattr("wrt.accel.queries.lists.MOST_ROWS", 50 * BATCH)
     for crossings in (False, True):
         assert (wrt.count_hits(accel, *asked, crossings=crossings) == 50).all()
     with refused(what=f"{50 * n} hits"):
@@ -129,9 +129,9 @@ def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     mesh = soup(rng)
-    asked, accel = rays(rng, mesh, MOST + 300), wrt.build(mesh)
+    asked, accel = rays(rng, mesh, BATCH + 300), wrt.build(mesh)
     expected = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
-    monkeypatch.setattr("wrt.accel.queries.all_hits.RAYS_AT_ONCE", 300)
+    monkeypatch.setattr("wrt.accel.queries.all_hits.BATCH", 300)
     found = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
     assert np.array_equal(found[2], expected[2]) and np.array_equal(found[0].first, expected[0].first)
     for field in ("t", "u", "v", "prim_id"):
@@ -142,15 +142,15 @@ def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("places", [0, 3], ids=["mesh", "instances"])
 @pytest.mark.parametrize("crossings", [False, True])
 def test_few_rays_hit_what_they_hit_among_many(mesh: wrt.Mesh, places: int, crossings: bool) -> None:
-    """A call with few rays uses buffers of earlier calls; rays of the soup can have more hits than these hold."""
+    """Rays use buffers of earlier calls; rays of the soup can have more hits than these hold."""
     matrices = [np.diag([scale, scale, scale, 1.0]) for scale in 1.0 / (1.0 + np.arange(places))]
     scene = wrt.Scene([wrt.Object(mesh, (wrt.Material(),), matrix) for matrix in matrices])
     accel = wrt.build(scene, movable=True) if places else wrt.build(mesh)
-    asked = rays(np.random.default_rng(7), mesh, MOST + 1)
+    asked = rays(np.random.default_rng(7), mesh, BATCH + 1)
     among = wrt.all_hits(accel, *asked, crossings=crossings)
     begin = 0
-    for n in (1, 0, 3, 550, 585, MOST):  # 550 and 585 rays have lists of equal length
-        begin = min(begin, MOST + 1 - n)
+    for n in (1, 0, 3, 550, 585, BATCH):  # 550 and 585 rays have lists of equal length
+        begin = min(begin, BATCH + 1 - n)
         few = wrt.all_hits(accel, *(array[begin:begin + n] for array in asked), crossings=crossings)
         rows = slice(among.first[begin], among.first[begin + n])
         assert np.array_equal(few.first, among.first[begin:begin + n + 1] - rows.start)

@@ -187,11 +187,9 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
     with refused("out", "NumPy array (3,)"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    with refused("out", "Warp array (3,)"):
-        ball.any_hit(*on_warp, out=np.zeros(3, bool))
-    for wrong in (wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
+    for wrong in (np.zeros(3, bool), wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
                   wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
-        with refused("out", "Warp array (3,)"):
+        with refused("out"):
             ball.any_hit(*on_warp, out=wrong)
 
 
