@@ -39,7 +39,8 @@ CPP_TOKEN = re.compile(r"(?<= )(?:[<>=!]=|[-+&|]=|&&|\|\||<<|>>|[-+*/<>&|])(?= )
                        r"|(?<![\w.])\d+(?:\.\d+)?(?=f?\b)")
 CPP_SKIPPED = re.compile(r'//.*|"(?:\\.|[^"\\])*"|^\s*#.*|^\s*(?:template|typedef)\b.*', re.MULTILINE)
 # Tests by the name of a changed file, where they are not those of the same name.
-TESTS = {"closest_point": "tests/wrt/accel/points/test_closest_points.py",
+TESTS = {"closest_points": "tests/wrt/accel/points/test_closest_points.py",
+         "closest_triangle": "tests/wrt/accel/points/test_closest_points.py",
          "nodes": "tests/kernels/wide/test_lanes.py tests/wrt/accel/points/test_closest_points.py",
          "traverse": "tests/kernels/traverse/test_common.py -k bvh4"}
 SANITIZE = ["tests/sanitize/test_headers.py", "-k", "results and walks"]
