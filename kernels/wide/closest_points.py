@@ -20,7 +20,7 @@ from wrt.kernels.traverse.instances import make_struct as make_instances
 from wrt.kernels.traverse.stack import key_of, make_uninitialized, reference_of, t_of
 from wrt.kernels.wide.closest_triangle import Nearest, nearer, nothing_near, squared_distance
 from wrt.kernels.wide.lanes import bits, lanes_only, row_type
-from wrt.kernels.wide.layout import STACK_SIZE, NodeLayout
+from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
 from wrt.kernels.wide.nodes import make_plane, node_type
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import make_gather, make_struct, row_size
@@ -33,9 +33,7 @@ else:
         return kernel(function, extra_build_options=with_headers("wide/closest.h"))
 
 NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # No node: greater than every stack entry.
-LARGEST = wp.constant(3.4028234663852886e38)  # Largest finite float32.
-BELOW = wp.constant(1.0 - 2.0**-20)  # Factor for the rounding of squared distances in float32.
-TINY = wp.constant(1e-36)  # A squared distance up to this counts as 0, because squares may underflow.
+BELOW = wp.constant(1.0 - 2.0**-20)  # Factor for the rounding of boxes and squared distances to float32.
 BLUR = wp.constant(2.0**-22)  # Bound on the rounding of a local point to float32, as a fraction of its largest coordinate.
 ROUNDING = wp.constant(2.0**-22)  # Widening of the upper level's boxes, as a fraction of their coordinates.
 POINT_ROUNDING = wp.constant(wp.float64(2.0**-36))  # Error of a local point over the point's coordinates (MAX_SPREAD).
@@ -91,22 +89,17 @@ class Place:
 
 @cache
 def make_bounds(width: int, compressed: bool) -> Any:
-    """Return bounds(nodes, first, p, blur) -> row (closest.h: child_bounds), and its form in plain Warp, for CUDA."""
+    """Return bounds(nodes, first, p, blur) -> row (closest.h: child_bounds); on CUDA, plain Warp computes one child after another."""
     (plane, _), row, node = make_plane(width, compressed), row_type(width), node_type(width, compressed)
 
     @wp.func
     def plain(nodes: wp.array(dtype=wp.float32), first: int, p: wp.vec3, blur: float) -> row:
         out = row()
+        pad = wp.vec3(blur, blur, blur)
         for j in range(width):
-            d2 = float(0.0)
-            for axis in range(3):
-                ahead = plane(nodes, first, 2 * axis, j) - p[axis]
-                behind = p[axis] - plane(nodes, first, 2 * axis + 1, j)
-                apart = wp.where(ahead > behind, ahead, behind) - blur
-                if apart > 0.0:  # not for NaN
-                    d2 = d2 + apart * apart
-            d2 = wp.where(d2 > TINY, BELOW * d2, 0.0)
-            out[j] = wp.where(d2 < LARGEST, d2, LARGEST)
+            lo = wp.vec3(plane(nodes, first, LO_X, j), plane(nodes, first, LO_Y, j), plane(nodes, first, LO_Z, j))
+            hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
+            out[j] = BELOW * float(squared_distance(p, lo - pad, hi + pad))
         return out
 
     @wp.func_native(lanes_only(f"""
@@ -122,7 +115,7 @@ def make_bounds(width: int, compressed: bool) -> Any:
             return plain(nodes, first, p, blur)
         return lanes(nodes, first, p, blur)
 
-    return bounds, plain
+    return bounds
 
 
 @cache
@@ -140,7 +133,7 @@ def make_near_triangles(width: int) -> Any:
 def make_closest_point(layout: NodeLayout, instances: bool) -> Any:
     """Return closest_point(accel, surfaces, place, best) -> Nearest: the closer of `best` and the closest point on any triangle."""
     struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
-    (_, exists), (bounds, _) = make_plane(layout.width, layout.compressed), make_bounds(layout.width, layout.compressed)
+    (_, exists), bounds = make_plane(layout.width, layout.compressed), make_bounds(layout.width, layout.compressed)
     near_triangles, width, size_of_row = make_near_triangles(layout.width), layout.width, row_size(Primitive, layout.width)
 
     @wp.func
