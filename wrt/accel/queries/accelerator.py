@@ -186,7 +186,7 @@ class Accelerator:
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
         snapshot = self.snapshot  # read once, because a refit may replace it during the query
-        query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), True, threads,
+        query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else arrays_of(out), world, invalid)
         counters = None
         if costs and any(costs.values()):
@@ -236,24 +236,24 @@ class Accelerator:
         if options:
             check_keywords("any_hit", options, ANY_HIT)
         snapshot = self.snapshot
-        query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), False, threads,
+        query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else (out,), **options)
         trace_query(snapshot, query)
         found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
 
 
-def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], gradients: bool, threads: int | None,
+def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], threads: int | None,
            out: Sequence[Any] | None, world: ArrayLike | None = None,
            invalid: str = "raise") -> tuple[Query, Shape | None, Callable[[Any], Any] | None]:
     """Return the query of a call, the shape of its results, and the function that converts them to the caller's library.
 
-    Shape and function are None for NumPy arrays (N, 3), the usual call. types: of the results; `rays`: the caller's origins, directions,
-    t_min and t_max; other arguments: see `Accelerator.closest_hit` and `rays_of`.
+    Shape and function are None for NumPy arrays (N, 3), the usual call. types: of the results, of which only hits have gradients; `rays`:
+    the caller's origins, directions, t_min and t_max; other arguments: see `Accelerator.closest_hit`.
     """
     if threads is not None:
         threads = thread_count(threads)
-    origin = snapshot.geometry.origin
+    origin, gradients = snapshot.geometry.origin, types is HIT_TYPES
     if are_rows(rays[0], rays[1]) and invalid == "raise":
         valid, shape, give, device = rays_of(*rays, gradients, origin), None, None, None
     else:
