@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import io
 import json
 import struct
 import tempfile
@@ -219,6 +220,9 @@ def read_picture(path: Path) -> object:
 # --- checked files ----------------------------------------------------------------------------------------------------
 
 
+ACCEL_WORDS = "bvh2", "bvh4", "bvh8", "bvh8c", "grid", "kdtree", "octree", "brute_force", "fast"
+
+
 def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
     """Damage the header or the arrays, usually with a right checksum, as an attacker would write it."""
     if rng.random() < 0.05:
@@ -226,12 +230,35 @@ def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
     magic, header, body = seed.data.split(b"\n", 2)
     body = body[:-CHECKSUM_BYTES]
     if rng.random() < 0.3:
-        tree = mutate_tree(json.loads(header), rng, ("bvh2", "bvh4", "bvh6", "bvh8", "bvh8c", "grid", "kdtree", "octree",
-                                                     "brute_force", "fast", "order"))
+        tree = mutate_tree(json.loads(header), rng, ("order",))
         header = json.dumps(tree).encode() if rng.random() < 0.9 else mutate(header, rng, TEXT)
     else:
         body = damaged_numbers(body, rng) if rng.random() < 0.8 else mutate(body, rng, BYTES)
     return signed(seed.suffix, magic, header, body)
+
+
+def damaged_accel(seed: Seed, other: Seed, rng: Random) -> Seed:
+    """Damage any bytes of an archive, or its header or an array, with right checksums, as an attacker would write it."""
+    if rng.random() < 0.1:
+        return Seed(seed.suffix, mutate(seed.data, rng, BYTES, other.data))
+    with np.load(io.BytesIO(seed.data)) as file:
+        arrays = dict(file)
+    if rng.random() < 0.3:
+        words = (*ACCEL_WORDS, "order", *arrays)
+        header = mutate_tree(json.loads(str(arrays["header"])), rng, words)
+        arrays["header"] = np.array(json.dumps(header))
+    else:
+        name = rng.choice(list(arrays))
+        data = arrays[name].tobytes()
+        data = damaged_numbers(data, rng) if rng.random() < 0.8 else mutate(data, rng, BYTES)
+        kind = arrays[name].dtype if rng.random() < 0.9 else np.dtype(rng.choice(("u1", "<i4", "<f4", ">i4", "<i8")))
+        array = np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], kind)
+        arrays[name] = array.reshape(arrays[name].shape) if array.size == arrays[name].size else array
+        if rng.random() < 0.05:
+            del arrays[name]
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return Seed(seed.suffix, file.getvalue())
 
 
 def signed(suffix: str, *parts: bytes) -> Seed:
@@ -313,7 +340,7 @@ def read_accel(path: Path) -> object:
 def load_accel_only(path: Path) -> Any:
     from wrt.accel.scenes.build import load_accel
 
-    holds_scene = b'"arrays"' in path.read_bytes()
+    holds_scene = b"scene.vertices" in path.read_bytes()
     return load_accel(path, None if holds_scene else ball(), threads=1)
 
 
@@ -411,7 +438,7 @@ FORMATS: dict[str, Format] = {
     "ply": Format(seeds.ply, damaged_mesh, read_mesh),
     "stl": Format(seeds.stl, damaged_mesh, read_mesh),
     "image": Format(seeds.images, damaged_image, read_picture, names_sizes=True),
-    "accel": Format(accel_seeds, damaged_checked, read_accel),
+    "accel": Format(accel_seeds, damaged_accel, read_accel),
     "checkpoint": Format(checkpoint_seeds, damaged_checked, read_checkpoint),
 }
 SLOW_FORMATS = {"render": Format(scene_seeds, damaged_scene, render_scene, names_sizes=True)}

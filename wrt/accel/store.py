@@ -1,37 +1,41 @@
-"""Files of structures, which `wrt build` writes and `wrt.load_accel` reads.
+"""Files of structures, which `wrt build` writes and `wrt.load_accel` reads: archives of NumPy arrays (.npz) with the suffix .accel.
 
-A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays. It has a checksum of the geometry, or the
-scene itself (wrt.accel.scene_arrays). The types of the arrays come from the structure's class. Indices are checked before a ray follows
-them.
+An array `header` is the version, the class and the statistics as JSON. The arrays "0.nodes", "0.order" ... are those of the first
+structure; files of instances have several. The scene's arrays (wrt.accel.scene_arrays) are "scene.vertices" ...; without them, the
+header has a checksum of the geometry. Nothing is unpickled, and all indices are checked before a ray follows them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from math import prod
+import json
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.lib import format as npy
 
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.scene_arrays import KINDS, arrays_of, scene_of
 from wrt.accel.snapshot import Built, Snapshot, Structure
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.checks import as_one
-from wrt.core.device import aligned, row_type
-from wrt.core.errors import InputError
-from wrt.core.files import check_writable, replacing
+from wrt.core.device import empty_aligned, row_type
+from wrt.core.errors import InputError, at
+from wrt.core.files import check_writable, read_file, replacing
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.core.types import JsonObject, PathLike
-from wrt.core.version import VERSION
+from wrt.core.types import PathLike
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
-MAGIC = b"wrt acceleration structure 2\n"
+VERSION = 3
 STATS = ("nodes", "leaves", "depth", "sah_cost")
-SIZES, OF_PARTS = "sizes of parts", "statistics of parts"  # arrays of files of instances: (P, n), and (P, 4) with STATS
+SCENE = "scene."
 
 
 def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype]:
@@ -50,42 +54,54 @@ def check_target(path: PathLike) -> None:
 
 def save(snapshot: Snapshot, path: PathLike, mesh: bool = False) -> None:
     """Write a structure over one mesh to a file atomically; mesh: with the mesh. Raises InputError if the file cannot be written."""
-    check_target(path)
-    structure, built = snapshot.structure, snapshot.arrays.on_host()
-    body = [each.tobytes() for each in built_rows(structure, built)]
-    sizes = {"bytes": dict(zip(array_types(structure.accel, structure.units.triangle), map(len, body), strict=False)),
-             "order": len(built.order)}
-    header = header_of(structure) | {"geometry": snapshot.mesh.checksum()} | sizes | {name: getattr(built, name) for name in STATS}
-    scene = arrays_of(snapshot) if as_one(mesh, bool, "mesh") else {}
-    with replacing(path) as file:
-        write_checked(file, MAGIC, header | listed(scene), [*scene.values(), *body])
+    _write(snapshot, [snapshot.arrays.on_host()], path, as_one(mesh, bool, "mesh"), geometry=snapshot.mesh.checksum())
 
 
 def save_instances(snapshot: Snapshot, bottoms: Sequence[Built], path: PathLike) -> None:
     """Write a structure over instances to a file atomically, with its scene; bottoms: of the structures of the lower level."""
+    _write(snapshot, bottoms, path, True)
+
+
+def _write(snapshot: Snapshot, parts: Sequence[Built], path: PathLike, scene: bool, **more: object) -> None:
     check_target(path)
-    structure, scene = snapshot.structure, arrays_of(snapshot)
-    rows = [built_rows(structure, built) for built in bottoms]
-    scene[SIZES] = np.array([[each.nbytes for each in part] for part in rows], np.int64)
-    scene[OF_PARTS] = np.array([[getattr(built, name) for name in STATS] for built in bottoms], np.float64)
+    structure = snapshot.structure
+    header = {"version": VERSION, "accel": structure.accel.name, "triangle": structure.units.triangle, "box": structure.units.box,
+              "instances": structure.units.instances, "parts": [[getattr(part, name) for name in STATS] for part in parts], **more}
+    arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
+    arrays |= {f"{SCENE}{name}": array for name, array in arrays_of(snapshot).items()} if scene else {}
+    for i, part in enumerate(parts):
+        for name, kind in array_types(structure.accel, structure.units.triangle).items():
+            rows = np.ascontiguousarray(np.atleast_1d(part.arrays[name])).astype(kind.base, copy=False)
+            arrays[f"{i}.{name}"] = rows.reshape(-1).view(np.uint8)
+        arrays[f"{i}.order"] = part.order
     with replacing(path) as file:
-        write_checked(file, MAGIC, header_of(structure) | listed(scene), [*scene.values(), *(each for part in rows for each in part)])
+        np.savez(file, **arrays)
 
 
-def header_of(structure: Structure) -> JsonObject:
-    return {"accel": structure.accel.name, "triangle": structure.units.triangle, "box": structure.units.box, "wrt": VERSION}
+def read_arrays(path: PathLike) -> dict[str, np.ndarray]:
+    """Return the arrays of an uncompressed .npz file. Each begins at a cache line, and is read at once: np.load takes twice as long.
 
-
-def listed(arrays: Mapping[str, np.ndarray]) -> JsonObject:
-    """Return the part of a header that describes the arrays at the begin of the body."""
-    return {"arrays": {name: [each.dtype.str, *each.shape] for name, each in arrays.items()}} if arrays else {}
-
-
-def built_rows(structure: Structure, built: Built) -> list[np.ndarray]:
-    """Return the arrays of a builder's result and its order, as they stand in files."""
-    types = array_types(structure.accel, structure.units.triangle)
-    rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
-    return [*(rows[name].astype(types[name].base, copy=False) for name in types), built.order.astype("<i4")]
+    Raises ValueError or an error of zipfile for anything else."""
+    arrays = {}
+    with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+        for info in archive.infolist():
+            file.seek(info.header_offset + 26)
+            begin = info.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))  # of the name and of the extra field
+            if info.compress_type != zipfile.ZIP_STORED or begin + info.file_size > os.fstat(file.fileno()).st_size:
+                raise ValueError(f"{info.filename} is compressed or truncated")
+            data = empty_aligned(info.file_size, np.uint8)
+            file.seek(begin)
+            file.readinto(data.data)
+            if zlib.crc32(data.data) != info.CRC:
+                raise ValueError(f"the checksum of {info.filename} does not match")
+            head = BytesIO(data[:1 << 16].tobytes())
+            if npy.read_magic(head) != (1, 0):
+                raise ValueError(f"{info.filename} is no array of version 1.0")
+            shape, by_columns, kind = npy.read_array_header_1_0(head)
+            if by_columns or kind.hasobject:
+                raise ValueError(f"{info.filename} has objects or columns")
+            arrays[info.filename.removesuffix(".npy")] = data[head.tell():].view(kind).reshape(shape)
+    return arrays
 
 
 def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None = None, device: str = DEFAULT_DEVICE,
@@ -94,91 +110,61 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
 
     Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
-    try:
-        with (read_checked(path, MAGIC, "acceleration structure") as (header, body),
-              np.errstate(over="ignore", invalid="ignore")):  # for values near the largest float32
-            cls = ACCELERATORS.get(header["accel"])
-            if cls is None:
-                raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
-            arrays, body = read_scene(header, body)
-            units = Units(header["triangle"], header["box"])
-            if SIZES in arrays:
-                if geometry is not None or place is None:
-                    raise InputError("must not be given: the file holds instances with their scene", argument="mesh")
-                return place(*parts_of(cls, units, arrays, body, device, threads), device, threads)
-            if geometry is None:
-                if not arrays:
-                    raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
-                attributes = scene_of(arrays)
-                geometry = mesh_of(attributes)
-            require_same_mesh(header, geometry)
-            built = read_arrays(cls, header, body)
-            return cls.restore(built, geometry, attributes, device, threads, units=units)
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise (error if error.path else error.at(path)) from error
-        raise InputError(f"is not a structure of this version of wrt ({type(error).__name__}: {error})", path=path) from error
+    with at(path=path):
+        read_file(path, 1)  # refuses pipes and devices
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
+                return _restored(read_arrays(path), geometry, attributes, device, threads, place)
+        except InputError:
+            raise
+        except Exception as error:  # zipfile, zlib, NumPy and json raise many kinds
+            if isinstance(error, MemoryError):
+                raise
+            raise InputError(f"is damaged, or not a structure of this version of wrt ({type(error).__name__}: {error})") from error
 
 
-def read_scene(header: JsonObject, body: memoryview) -> tuple[dict[str, np.ndarray], memoryview]:
-    """Return the arrays at the begin of the body, and the rest of the body. Raises InputError if they do not fit."""
-    arrays, at = {}, 0
-    for name, (kind, *shape) in dict(header.get("arrays", {})).items():
-        dtype = np.dtype({SIZES: "<i8", OF_PARTS: "<f8"}.get(name) or KINDS[name][0])
-        sound = kind == dtype.str and all(type(n) is int and n >= 0 for n in shape)  # a list times a number would be a long list
-        if not sound or at + (size := dtype.itemsize * prod(shape)) > len(body):
-            raise InputError(f"is damaged: array {name!r} does not fit")
-        arrays[name] = np.frombuffer(body[at:at + size], dtype).reshape(shape).copy()
-        at += size
-    return arrays, body[at:]
-
-
-def mesh_of(scene: FlatScene) -> Geometry:
-    """Return the geometry of a scene without instances. Raises InputError for any other scene."""
-    if not isinstance(scene.geometry, Geometry):
-        raise InputError("is damaged: its scene has instances")
-    return scene.geometry
-
-
-def parts_of(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], body: memoryview, device: str,
-             threads: int | None) -> tuple[list[Any], InstancedGeometry, FlatScene]:
-    """Return the structures of the lower level, the geometry and the scene from the arrays and the body of a file of instances."""
-    sizes, stats, at = arrays.pop(SIZES), arrays.pop(OF_PARTS), 0
-    scene = scene_of(arrays)
-    types, bottoms, geometry = array_types(cls, units.triangle), [], scene.geometry
-    if not isinstance(geometry, InstancedGeometry):
-        raise InputError("is damaged: its scene has no instances")
-    parts = geometry.parts
-    if not (len(parts) == len(sizes) == len(stats) > 0 and sizes.shape[1:] == (len(types) + 1,) and (sizes >= 0).all()):
-        raise InputError("is damaged: its instances do not fit")
-    for part, row, numbers in zip(parts, sizes.tolist(), stats.tolist(), strict=True):
-        header = {"triangle": units.triangle, "bytes": dict(zip(types, row, strict=False)), "order": row[-1] // 4}
-        built = read_arrays(cls, header | dict(zip(STATS, numbers, strict=True)), body[at:at + sum(row)])
-        at += sum(row)
-        bottoms.append(cls.restore(built, part, None, device, threads, units=units))
-    return bottoms, geometry, scene
-
-
-def require_same_mesh(header: JsonObject, geometry: Geometry) -> None:
-    """Raise InputError unless the structure was built over a geometry with the same arrays."""
+def _restored(arrays: dict[str, np.ndarray], geometry: Geometry | None, attributes: FlatScene | None, device: str,
+              threads: int | None, place: Callable[..., Any] | None) -> Any:
+    """Make the structure of a file's arrays, as `read` does."""
+    header = json.loads(str(arrays.pop("header")))
+    if header["version"] != VERSION:
+        raise ValueError("another version")
+    cls, units = ACCELERATORS.get(header["accel"]), Units(header["triangle"], header["box"])
+    if cls is None:
+        raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
+    parts = [_part(cls, units, arrays, i, *stats) for i, stats in enumerate(header["parts"])]
+    in_file = {name.removeprefix(SCENE): array for name, array in arrays.items() if name.startswith(SCENE)}
+    if any(array.dtype != KINDS[name][0] for name, array in in_file.items()):
+        raise ValueError("an array of another type")
+    if header["instances"] and (geometry is not None or place is None):
+        raise InputError("must not be given: the file holds instances with their scene", argument="mesh")
+    if geometry is None:
+        if not in_file:
+            raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
+        attributes = scene_of(in_file)
+        if isinstance(attributes.geometry, InstancedGeometry) != bool(header["instances"]):
+            raise ValueError("a scene of another kind")
+        if isinstance(attributes.geometry, InstancedGeometry):
+            assert place is not None
+            bottoms = [cls.restore(built, part, None, device, threads, units=units)
+                       for built, part in zip(parts, attributes.geometry.parts, strict=True)]
+            return place(bottoms, attributes.geometry, attributes, device, threads)
+        geometry = attributes.geometry
     if header["geometry"] != geometry.checksum():
         raise InputError("was built over another mesh")
+    (built,) = parts
+    return cls.restore(built, geometry, attributes, device, threads, units=units)
 
 
-def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
-    types = array_types(cls, header["triangle"])
-    arrays, at = {}, 0
-    for name, dtype in types.items():
-        size = header["bytes"][name]
-        if not isinstance(size, int) or size < 0 or size % dtype.itemsize or at + size > len(body):
-            raise InputError(f"is damaged: array {name!r} does not fit")
-        arrays[name] = aligned(np.frombuffer(body[at:at + size], dtype.base).reshape((-1, *dtype.shape)))
-        at += size
-    if len(body) - at != 4 * header["order"]:
-        raise InputError("is damaged: the order does not fit")
-    order = np.frombuffer(body[at:], "<i4").astype(np.int32)
-    nodes, leaves, depth, sah_cost = (header[name] for name in STATS)
-    return Built(arrays, order, int(nodes), int(leaves), int(depth), float(sah_cost))
+def _part(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], i: int, nodes: int, leaves: int, depth: int,
+          sah_cost: float) -> Built:
+    """Return the arrays and statistics of structure i of a file."""
+    rows = {name: arrays[f"{i}.{name}"].view(kind.base).reshape((-1, *kind.shape))
+            for name, kind in array_types(cls, units.triangle).items()}
+    order = arrays[f"{i}.order"]
+    if order.dtype != np.int32 or order.ndim != 1:
+        raise ValueError("an order of another type")
+    return Built(rows, order, int(nodes), int(leaves), int(depth), float(sah_cost))
 
 
 def check_order(order: np.ndarray, count: int, name: str) -> None:
