@@ -38,12 +38,6 @@ def bounds_of(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     return lo, np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))
 
 
-def longest_side(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Return the longest side of all boxes, float32."""
-    with np.errstate(over="ignore"):
-        return np.asarray(np.nextafter((hi - lo).max(initial=0.0), np.float32(np.inf)))
-
-
 def shapes_of(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], clip: bool = True) -> WarpStruct:
     """Upload the primitives as kernels.build.clip.Shapes. bounds: their padded boxes. clip: False to clip boxes, not triangles."""
     cpu, shapes = start("cpu"), Shapes()

@@ -9,16 +9,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.cells.common import (
-    MAX_REFERENCES,
-    bounds_of,
-    build_tree,
-    check_references,
-    longest_side,
-    one_row,
-    require_between,
-    shapes_of,
-)
+from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, one_row, require_between, shapes_of
 from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.checks import shown
@@ -206,7 +197,9 @@ class Octree(OneMesh):
 def box_arrays(bounds: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the root box of the primitives' boxes, and their longest side."""
     lo, hi = bounds
-    return {"lo": lo.min(axis=0, initial=np.inf), "hi": hi.max(axis=0, initial=-np.inf), "extent": longest_side(lo, hi)}
+    with np.errstate(over="ignore"):
+        extent = np.asarray(np.nextafter((hi - lo).max(initial=0.0), np.float32(np.inf)))
+    return {"lo": lo.min(axis=0, initial=np.inf), "hi": hi.max(axis=0, initial=-np.inf), "extent": extent}
 
 
 def root_of(bounds: tuple[np.ndarray, np.ndarray], max_growth: float, spare: int = 0) -> np.ndarray:
