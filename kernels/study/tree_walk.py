@@ -1,7 +1,6 @@
 """A walk of wide trees whose rules are arguments: order of children, culling at the pop, stack or queue; with a log of each ray.
 
-The walk pushes every child that the ray enters, then pops the next one. So a ray's log tells which entries waited at each step, and other
-kernels of this folder replay it for warps, caches and prefetchers."""
+The walk pushes every child that the ray enters, then pops the next one. So a ray's log tells how many entries waited at each step."""
 
 import warp as wp
 
@@ -30,13 +29,12 @@ class StudyTree:
 
 @wp.struct
 class StudyRays:
-    """Rays, arrays (N,). start: reference at which the walk begins, 0 for the root; any_hit: 1 for a ray that ends at its first hit."""
+    """Rays, arrays (N,). any_hit: 1 for a ray that ends at its first hit."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
     t_max: wp.array(dtype=wp.float32)
     any_hit: wp.array(dtype=wp.int8)
-    start: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -58,11 +56,9 @@ class Work:
     boxes: int  # Boxes tested.
     tests: int  # Primitives tested.
     pushes: int
-    dropped: int  # Popped entries that were culled.
     waiting: int  # Largest number of entries that waited.
     prim_id: int  # The hit, -1 for a miss.
     t: float
-    leaf: int  # Reference of the leaf of the hit; 0 for a miss.
 
 
 @wp.struct
@@ -73,8 +69,6 @@ class WalkLog:
     fetch_first: wp.array(dtype=wp.int64)  # Ray i has the fetches fetch_first[i] .. fetch_first[i + 1] - 1.
     fetch: wp.array(dtype=wp.int32)  # Reference of each fetched node or leaf.
     entered: wp.array(dtype=wp.int8)  # Number of entries that each fetch pushed.
-    push_first: wp.array(dtype=wp.int64)
-    push: wp.array(dtype=wp.int32)  # Reference of each pushed entry.
 
 
 @wp.func
@@ -104,11 +98,8 @@ def visit_leaf(tree: StudyTree, surfaces: Surfaces, probe: Probe, reference: int
     """Test the primitives of a leaf; return the best hit and the new counts."""
     work.leaves += 1
     for i in range(leaf_count(reference)):
-        before = best.prim_id
         best = intersect(probe, surfaces, tree.primitives[leaf_first(reference) * tree.width + i], best)
         work.tests += 1
-        if best.prim_id != before:
-            work.leaf = reference
         if any_hit and best.prim_id != NO_HIT:
             break
     return best, work
@@ -121,13 +112,6 @@ def write_fetch(log: WalkLog, i: int, work: Work, reference: int, entered: int):
         at = log.fetch_first[i] + wp.int64(work.inner + work.leaves - 1)
         log.fetch[at] = reference
         log.entered[at] = wp.int8(entered)
-
-
-@wp.func
-def write_push(log: WalkLog, i: int, work: Work, reference: int):
-    """Log the push that `work` already includes."""
-    if log.fetch_first.shape[0] > 0:
-        log.push[log.push_first[i] + wp.int64(work.pushes - 1)] = reference
 
 
 @kernel
@@ -144,7 +128,7 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
     work = Work()
     head = int(0)
     tail = int(0)  # A stack ends here, and so does a queue, which begins at `head`.
-    reference = int(rays.start[i])
+    reference = int(0)
     while True:
         if reference < 0:
             best, work = visit_leaf(tree, surfaces, probe, reference, any_hit, best, work)
@@ -164,7 +148,6 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
                 scratch[base + tail % QUEUE] = keys[j]
                 tail = tail + 1
                 work.pushes += 1
-                write_push(log, i, work, reference_of(keys[j]))
             work.waiting = wp.max(work.waiting, tail - head)
         found = bool(False)
         while tail > head and not found:
@@ -178,8 +161,6 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
             if rules.culled == 0 or t_of(key) <= best.t:
                 reference = reference_of(key)
                 found = True
-            else:
-                work.dropped += 1
         if not found:
             break
     work.prim_id = wp.where(best.prim_id == NO_HIT, -1, best.prim_id)

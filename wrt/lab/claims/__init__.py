@@ -13,9 +13,8 @@ class Claims(Plan):
     NAMES: claims; default: all. Without files, generated scenes stand in for the published ones."""
 
     COMMAND, STUDY = "bench claims", "wrt.lab.bench.claims"
-    QUICK = {"side": 48, "names": ("ttp-nodes", "rules", "coop-rt", "cwbvh", "short-stack")}
-    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv or .json, or charts as .svg or .png"
+    QUICK = {"side": 48, "names": ("ttp-nodes", "coop-rt", "cwbvh")}
     names: Sequence[str] = option((), of=("claim", "wrt.lab.claims.claim:CLAIMS"))
-    scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE,conference=FILE",
-                                  check="wrt.lab.claims.scene_files:scene_files")
+    scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE",
+                                  check="wrt.lab.claims.scenes:scene_files")
     side: int = option(128, "Side of the square pictures, in pixels", (8, 1024))

@@ -1,6 +1,6 @@
 """Scenes, cameras and workloads of the claims: path tracing, ambient occlusion and shadow rays."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,6 +9,8 @@ import numpy as np
 from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
+from wrt.core.checks import require_known
+from wrt.core.errors import InputError
 from wrt.core.types import PathLike
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.meshes import terrain
@@ -19,7 +21,7 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, merged, torus, tube
 
 BOUNCES = 3
-INSIDE = ("sponza", "conference", "hall", "kitchen", "room")  # Scenes that the camera sees from the middle of their box.
+INSIDE = ("sponza", "hall")  # Scenes that the camera sees from the middle of their box.
 AO_RADIUS = 0.1  # Length of ambient occlusion rays over the radius of the scene's bounding sphere.
 PATH, AO, SHADOW = "path tracing", "ambient occlusion", "shadow"
 
@@ -156,8 +158,8 @@ def in_warps(scene: Scene, rays: Rays) -> Rays:
     return out
 
 
-def surface(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, t: np.ndarray, prim_id: np.ndarray) -> tuple[np.ndarray,
-np.ndarray]:
+def surface(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, t: np.ndarray,
+            prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return hit points and unit normals towards the rays' origins, (N, 3) float64 each; a triangle without area gets the ray's reverse."""
     corners = geometry.vertices[geometry.faces[prim_id]].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -168,9 +170,13 @@ np.ndarray]:
     return origins + t[:, None].astype(np.float64) * directions, normals
 
 
-def subdivided(mesh: Mesh) -> Mesh:
-    """Cut each triangle into four at the midpoints of its sides."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
-    corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
-    return Mesh(corners, np.arange(len(corners)).reshape(-1, 3), name=mesh.name)
+def scene_files(pairs: Sequence[str]) -> dict[str, str]:
+    """Return the mesh file of each published scene from "name=file". Raise InputError for an unknown name, and without a file."""
+    files = {}
+    for pair in pairs:
+        name, given, path = pair.partition("=")
+        if not given or not path:
+            raise InputError(f"{pair!r} names no file", argument="scene", hint=f"write {name or 'bunny'}=FILE")
+        require_known(name, STAND_INS, "scene", "scene")
+        files[name] = path
+    return files

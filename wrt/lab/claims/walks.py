@@ -9,7 +9,7 @@ import warp as wp
 
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress
-from wrt.accel.bvh.wide_tree import WideTree, collapse, leaf_rows
+from wrt.accel.bvh.wide_tree import WideTree, collapse
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, on_host, start, upload
 from wrt.core.errors import InputError
@@ -21,7 +21,6 @@ from wrt.kernels.traverse.common import Units
 from wrt.lab.rtcore.whatif import quantised
 
 RAYS_PER_LAUNCH = 2048
-NODE_BYTES = 64  # of an inner node and of a leaf
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class Rays:
 
 
 class Tree(NamedTuple):
-    """A wide tree with its primitives on the device. bytes: size of the nodes of a structure with this tree."""
+    """A wide tree with its primitives on the device."""
 
     wide: WideTree
     data: WarpStruct
@@ -52,10 +51,6 @@ class Tree(NamedTuple):
     @property
     def width(self) -> int:
         return int(self.wide.children.shape[1])
-
-    @property
-    def nodes(self) -> int:
-        return len(self.wide.children)
 
 
 class Rules(NamedTuple):
@@ -68,28 +63,17 @@ class Rules(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Result of `walk`. The log has M fetches and P pushes of all rays."""
+    """Result of `walk`. The log has M fetches of all rays."""
 
     counts: np.ndarray  # (N,) records of kernels.study.tree_walk.Work.
     first: np.ndarray  # (N + 1,) int64. Ray i has the fetches first[i] .. first[i + 1] - 1.
     fetch: np.ndarray  # (M,) int32 references.
     entered: np.ndarray  # (M,) int64, entries that each fetch pushed.
-    push_first: np.ndarray  # (N + 1,) int64.
-    push: np.ndarray  # (P,) int32 references.
-    nodes: int  # Of the tree.
 
     @cached_property
     def fetches(self) -> np.ndarray:
         """Number of nodes and leaves that each ray fetches, (N,) int64."""
         return self.counts["inner"].astype(np.int64) + self.counts["leaves"]
-
-    @cached_property
-    def address(self) -> np.ndarray:
-        """Address of each fetch in bytes, (M,) int64: nodes of NODE_BYTES, then leaves, one row of primitives each."""
-        return self.addresses(self.fetch)
-
-    def addresses(self, reference: np.ndarray) -> np.ndarray:
-        return NODE_BYTES * np.where(reference < 0, self.nodes + leaf_rows(reference), reference)
 
     @cached_property
     def owner(self) -> np.ndarray:
@@ -119,20 +103,13 @@ def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: int = 32
     return tree_of(geometry, wide)
 
 
-def upload_rays(rays: Rays, starts: np.ndarray | None = None) -> WarpStruct:
-    """Upload rays. starts: (N,) int32 references at which the walks begin; None: the root."""
-    cpu, out = start("cpu"), kernels.StudyRays()
-    out.origin, out.direction = (upload(np.ascontiguousarray(each), wp.vec3, cpu) for each in (rays.origins, rays.directions))
-    out.t_max = upload(rays.t_max.astype(np.float32), wp.float32, cpu)
-    out.any_hit = upload((rays.kind == 1).astype(np.int8), wp.int8, cpu)
-    out.start = upload(np.zeros(len(rays), np.int32) if starts is None else starts.astype(np.int32), wp.int32, cpu)
-    return out
-
-
-def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False, starts: np.ndarray | None = None) -> Walk:
-    """Trace rays by `rules`, with a log if asked. starts: see `upload_rays`. Raise InputError if a queue needs more than QUEUE entries."""
-    cpu, n = start("cpu"), len(rays)
-    given, device_rules, out = upload_rays(rays, starts), kernels.Rules(), wp.zeros(n, dtype=kernels.Work, device=cpu)
+def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False) -> Walk:
+    """Trace rays by `rules`, with a log if asked. Raise InputError if a queue needs more than QUEUE entries."""
+    cpu, n, given = start("cpu"), len(rays), kernels.StudyRays()
+    given.origin, given.direction = (upload(np.ascontiguousarray(each), wp.vec3, cpu) for each in (rays.origins, rays.directions))
+    given.t_max = upload(rays.t_max.astype(np.float32), wp.float32, cpu)
+    given.any_hit = upload((rays.kind == 1).astype(np.int8), wp.int8, cpu)
+    device_rules, out = kernels.Rules(), wp.zeros(n, dtype=kernels.Work, device=cpu)
     device_rules.ordered, device_rules.culled, device_rules.queue = map(int, rules)
     scratch = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.uint64, device=cpu)
 
@@ -146,15 +123,11 @@ def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False, starts: np.nda
         raise InputError(f"a ray needs more than {int(QUEUE)} entries in its queue")
     none = np.zeros(0, np.int64)
     if not log:
-        return Walk(counts, none, none, none, none, none, tree.nodes)
-    first, push_first = (np.concatenate([[0], np.cumsum(each, dtype=np.int64)]) for each in
-                         (counts["inner"].astype(np.int64) + counts["leaves"], counts["pushes"]))
+        return Walk(counts, none, none, none)
+    first = np.concatenate([[0], np.cumsum(counts["inner"].astype(np.int64) + counts["leaves"])])
     record = kernels.WalkLog()
-    record.fetch_first, record.push_first = upload(first, wp.int64, cpu), upload(push_first, wp.int64, cpu)
-    record.fetch, record.push = (wp.zeros(int(each[-1]), dtype=wp.int32, device=cpu) for each in (first, push_first))
+    record.fetch_first = upload(first, wp.int64, cpu)
+    record.fetch = wp.zeros(int(first[-1]), dtype=wp.int32, device=cpu)
     record.entered = wp.zeros(int(first[-1]), dtype=wp.int8, device=cpu)
     trace(record)
-    return Walk(counts, first, record.fetch.numpy().copy(), record.entered.numpy().astype(np.int64), push_first,
-                record.push.numpy().copy(), tree.nodes)
-
-
+    return Walk(counts, first, record.fetch.numpy().copy(), record.entered.numpy().astype(np.int64))
