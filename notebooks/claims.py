@@ -7,8 +7,8 @@
 # 3. the bytes that compressed nodes save.
 #
 # In each plot a bar is wrt's count, and a black line is the published value; its title names the source. The scenes and cameras are not
-# those of the papers, so a factor of 1.5 counts as agreement. `python -m wrt bench claims` has all 22 claims, and takes the papers'
-# scenes as files.
+# those of the papers, so a factor of 1.5 counts as agreement. `python -m wrt bench claims` has all nine claims, and takes the
+# papers' scenes as files.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.
 
@@ -21,10 +21,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.claims.claim import CLAIMS, TTP_RULES, Study
-from wrt.lab.claims.scenes import AO, PATH, SHADOW
-from wrt.lab.claims.walks import Rules
-from wrt.lab.claims.warps import helped
+from wrt.lab.claims.claim import CLAIMS, Study
+from wrt.lab.claims.counted import helped
+from wrt.lab.claims.walks import Rules, walk
 
 QUICK = "WRT_QUICK" in os.environ
 study = Study(side=24 if QUICK else 64)
@@ -96,44 +95,36 @@ for each in ttp:
 
 # %% [markdown]
 # The statue agrees with the bunny, the hall differs from Sponza (orange). The reasons printed above are measurements: shadow rays end
-# early, and a finer mesh needs more nodes.
+# early, and rays that hit take more nodes.
 #
 # The same rays by other rules: nodes of 2 to 8 children, with children sorted by distance or not, and with culling of popped entries or
 # not.
 
 # %%
-rules = list(CLAIMS["rules"].measure(study))
+RULES = {"unsorted": Rules(False, False), "unsorted, culled": Rules(False, True), "sorted": Rules(True, False),
+         "sorted, culled": Rules(True, True)}
+WIDTHS = (2, 4, 6, 8)
+nodes = {(name, said): [walk(study.tree(name, width), study.rays(name), rule).fetches.mean() for width in WIDTHS]
+         for name in SCENES for said, rule in RULES.items()}
 fig, axes = plt.subplots(1, 2, figsize=(7.4, 3.6), dpi=80, layout="constrained")
 for ax, (name, shown) in zip(axes, SCENES.items(), strict=True):
-    for order in ("unsorted", "unsorted, culled", "sorted", "sorted, culled"):
-        found = {int(width.split()[1]): each.ours for each in rules for _, scene, width, said in [each.what.split(", ", 3)]
-                 if (scene, said) == (name, order)}
-        ax.plot(list(found), list(found.values()), "o-", label=order)
+    for said in RULES:
+        ax.plot(WIDTHS, nodes[name, said], "o-", label=said)
     mean = next(each.published for each in ttp if each.what.startswith(f"nodes a ray, {name}"))
     ax.plot(6, mean, "k_", markersize=22, markeredgewidth=2.5)
     ax.annotate(f"published for {name}:\n{mean} (TTP, Table I)", (6, mean), (0, 30), textcoords="offset points", ha="center", fontsize=8,
                 arrowprops={"arrowstyle": "-"})
     ax.set(title=f"{shown} (wrt's own finding)", xlabel="children per node (number)", ylabel="nodes per ray (number)",
-           xticks=(2, 4, 6, 8))
-    ax.set_ylim(0, 1.35 * max(mean, *(each.ours for each in rules if f", {name}, " in each.what)))
+           xticks=WIDTHS)
+    ax.set_ylim(0, 1.35 * max(mean, *nodes[name, "unsorted"]))
     ax.legend(fontsize=7, loc="lower left")
 plt.show()
-at = {each.what: each.ours for each in rules}
 for name, shown in SCENES.items():
-    loose, tight = at[f"nodes a ray, {name}, width 6, unsorted"], at[f"nodes a ray, {name}, width 6, sorted, culled"]
+    loose, tight = nodes[name, "unsorted"][2], nodes[name, "sorted, culled"][2]
     print(f"{shown}, width 6: {loose:.1f} nodes unsorted, {tight:.1f} sorted and culled: {1 - tight / loose:.0%} fewer")
 
 # %% [markdown]
 # **Rules that a simulator chose move the count by a fifth.** Compare proposals by the same rules only.
-#
-# The rules also decide how well a prefetcher guesses. It fetches the next 1, 2 and 16 entries of the stack ahead. An entry that is culled
-# later was fetched in vain.
-
-# %%
-ahead = list(CLAIMS["ttp-prefetch"].measure(study))
-fig, ax = plt.subplots(figsize=(7.4, 2.6), dpi=80, layout="constrained")
-show(ax, "ttp-prefetch", ahead, "share (%)")
-plt.show()
 
 # %% [markdown]
 # ## 2. CoopRT's bound: idle lanes that help
@@ -170,27 +161,6 @@ plt.show()
 
 # %% [markdown]
 # The published gains are gains in time. Path tracing gains most in the paper and here; the order of the two others is not the same.
-# The sorted, culled walk has shorter rays. Does it leave less to gain?
-
-# %%
-kinds = {"unsorted, not culled": TTP_RULES, "sorted, culled": Rules()}
-theirs = {workload: next(each.published for each in coop if each.what == f"gain of help, {workload}") for workload in (PATH, AO, SHADOW)}
-fig, ax = plt.subplots(figsize=(7.0, 2.6), dpi=80, layout="constrained")
-for i, (said, rule) in enumerate(kinds.items()):
-    for j, workload in enumerate(theirs):
-        log, warp = study.ttp("sponza", workload, rule), study.rays("sponza", workload).warp
-        first = np.searchsorted(warp, np.arange(warp.max() + 1))
-        gain = np.maximum.reduceat(log.fetches, first).sum() / helped(log, warp).sum()
-        ax.barh(j + 0.36 * i - 0.18, gain, 0.34, color=f"C{2 * i}", label=said if j == 0 else None)
-        ax.text(max(gain, theirs[workload]), j + 0.36 * i - 0.18, f" {gain:.2f}", va="center", fontsize=8)
-for j, value in enumerate(theirs.values()):
-    published(ax, j, value)
-ax.set_yticks(range(3), theirs)
-ax.invert_yaxis()
-ax.margins(x=0.3)
-ax.set(xlabel="steps alone over steps with help (ratio)", title="black: published, CoopRT, ISCA 2025, Figures 9, 10 and 17")
-ax.legend(fontsize=8)
-plt.show()
 
 # %% [markdown]
 # ## 3. Compressed nodes

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.record import begin_light, end_light, last_ray, make_recorder
+from wrt.kernels.loops.record import RAYS, PathEnd, record_end, record_light
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
@@ -18,7 +18,7 @@ from wrt.kernels.shade.follow_up import FOLLOWED, add_cuts, make_follow_up
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
-from wrt.kernels.shade.shadows import make_transmittance
+from wrt.kernels.shade.shadows import Shadow, make_transmittance
 from wrt.kernels.shade.step import DirectLight, Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
 from wrt.kernels.shade.surface import with_normal
 from wrt.kernels.structs import Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
@@ -49,13 +49,12 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
             request = step.shadow_request(shaded, step.sample_light(lighting, surfaces, i, shaded.surface, point))
-            if wp.static(features.recording):
-                begin_light(accel.record, i, request)
+            shadow = Shadow()
             if any_positive(request.value):
                 shadow = transmittance(accel, surfaces, request.ray, request.end)
-                if wp.static(features.recording):
-                    end_light(accel.record, shadow)
                 out = add_light(out, request.value, shaded.scatter, shadow)
+            if wp.static(features.recording):
+                record_light(accel.record, i, request, shadow)
         return out
 
     return direct_light
@@ -69,7 +68,6 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
     background_radiance = BACKGROUNDS[features.background].radiance
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step)
-    recorder = make_recorder(features)
 
     @wp.func
     def radiance(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, limits: Limits, camera_ray: Ray, key: wp.uint32,
@@ -87,10 +85,13 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
             traced += 1
             hit = closest_hit(accel, surfaces, ray)
             if wp.static(features.recording):
-                ray_index = last_ray(accel.record)
+                end = PathEnd()
+                end.ray = accel.record.used[RAYS] - 1
+                end.path = path
             if hit.prim_id < 0:
                 if wp.static(features.recording):
-                    recorder.miss(accel.record, ray_index, path, background_radiance(lighting.background, path.direction))
+                    end.background = background_radiance(lighting.background, path.direction)
+                    record_end(accel.record, end)
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
             surface = shading.surface_at(surfaces, ray, hit)
@@ -115,7 +116,11 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
                 if receives_light(shaded.scatter):
                     direct = direct_light(accel, surfaces, lighting, shaded, index)
             if wp.static(features.recording):
-                recorder.surface(accel.record, ray_index, path, surface, shaded, next, direct)
+                end.surface = surface
+                end.shaded = shaded
+                end.next = next
+                end.direct = direct
+                record_end(accel.record, end)
             out = add_surface_light(add_cuts(out, next), next.pending_light, direct)
         return out
 

@@ -123,8 +123,7 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
 
 
 # The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
-ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
-          "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
+ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128), "lights": (record.AskedLight, 256)}
 
 
 class Inspector:
