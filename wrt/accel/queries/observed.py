@@ -113,13 +113,8 @@ def record_steps(accel: object, origins: ArrayLike, directions: ArrayLike, t_min
     np.cumsum(on_host(observed(snapshot, query, "log", np.zeros(len(rays.origins), np.int64)).first), out=first[1:])
     recorder = observed(snapshot, query, "log", first[:-1].copy(), steps=int(first[-1]))
     counts, steps = on_host(recorder.counts), on_host(recorder.steps)
-    nodes, primitives = (int(counts[name].sum(dtype=np.int64)) for name in ("nodes", "primitives"))
-    found = np.bincount(steps["kind"], minlength=len(of.KINDS))
-    if found[of.NODE] != nodes or found[of.TEST] != primitives:
-        raise InputError(f"records {found[of.NODE]} nodes and {found[of.TEST]} primitives, but counts {nodes} and {primitives}",
-                         argument="accel", hint="test its leaves with kernels.traverse.leaf")
     origin, direction = np.array(rays.origins, np.float32), np.array(rays.directions, np.float32)
     t, u, v, prim_id = map(np.asarray, out)
     return RecordedSteps(snapshot.structure.accel.name, origin, direction, t, u, v, prim_id, counts, first, steps,
-                         int(counts["node_bytes"].sum(dtype=np.int64)) // max(nodes, 1),
+                         int(counts["node_bytes"].sum(dtype=np.int64)) // max(int(counts["nodes"].sum(dtype=np.int64)), 1),
                          size_of(snapshot.structure.units.triangle_test.record))

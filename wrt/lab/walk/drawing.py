@@ -14,8 +14,7 @@ from wrt.core.errors import InputError
 from wrt.core.files import check_writable, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
-from wrt.lab.walk.record import WalkRecord
-from wrt.lab.walk.regions import Region
+from wrt.lab.walk.record import Region, WalkRecord
 from wrt.renderer.inspector.section import Plane, cut
 
 if TYPE_CHECKING:

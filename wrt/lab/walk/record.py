@@ -1,4 +1,4 @@
-"""The record of a walk: its steps, as values and in words, with the stack and the closest hit, and their counts."""
+"""The record of a walk: its steps, as values and in words, with the stack and the closest hit, and the regions that they are about."""
 
 import math
 from dataclasses import dataclass, fields
@@ -11,7 +11,67 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.observed import RecordedSteps
 from wrt.core.types import JsonObject
 from wrt.kernels.traverse import steps as of
-from wrt.lab.walk.regions import Region, regions_of
+
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The points p with normals @ p + offsets <= 0, or, if the radius is above 0, a sphere.
+
+    normals: (K, 3); offsets: (K,); float64. center, radius: of a sphere.
+    """
+
+    normals: np.ndarray
+    offsets: np.ndarray
+    center: np.ndarray
+    radius: float = 0.0
+
+    @classmethod
+    def box(cls, lo: np.ndarray, hi: np.ndarray, radius: float = 0.0) -> "Region":
+        lo, hi = lo.astype(np.float64), hi.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            return cls(AXES, np.concatenate([-hi, lo]), 0.5 * (lo + hi), radius)
+
+    def cut(self, normal: np.ndarray, offset: float) -> "Region":
+        """Return the part on the side of a plane where dot(normal, p) + offset <= 0."""
+        return Region(np.append(self.normals, [normal.astype(np.float64)], axis=0), np.append(self.offsets, offset), self.center)
+
+    def interval(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, float]:
+        """Return t where the line enters and leaves; the first is greater if it misses."""
+        o, d = origin.astype(np.float64), direction.astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            if self.radius > 0.0:
+                a, b = d @ d, d @ (self.center - o)
+                root = b * b - a * (np.sum((self.center - o) ** 2) - self.radius**2)
+                return (float((b - np.sqrt(root)) / a), float((b + np.sqrt(root)) / a)) if root >= 0.0 else (np.inf, -np.inf)
+            height, slope = self.normals @ o + self.offsets, self.normals @ d
+            t = -height / slope
+        if (height[slope == 0.0] > 0.0).any() or self.radius < 0.0:
+            return np.inf, -np.inf
+        return float(t[slope < 0.0].max(initial=-np.inf)), float(t[slope > 0.0].min(initial=np.inf))
+
+
+def regions_of(steps: np.ndarray) -> list[Region | None]:
+    """Return the region of each step, None for pushes, pops, tests and what has no recorded bounds. steps: of one ray."""
+    known: dict[tuple[int, int], Region] = {}
+    node: tuple[int, int] | None = None
+    out: list[Region | None] = []
+    for step in steps:
+        kind, key = step["kind"], (int(step["index"]), int(step["count"]))
+        if kind == of.NODE:
+            node = (key[0], int(of.INNER))
+            key = node
+        elif kind == of.BOX:
+            known[key] = Region.box(step["lo"], step["hi"], float(step["edges"][0]))
+        elif kind == of.CELL:
+            known[key] = Region.box(step["lo"], step["hi"])
+        elif kind == of.PART and node in known:
+            known[key] = known[node].cut(step["lo"], float(step["hi"][0]))
+        elif kind == of.PLANE and node is not None:
+            key = node
+        out.append(known.get(key) if kind in (of.NODE, of.BOX, of.CELL, of.PART, of.PLANE, of.LEAF) else None)
+    return out
 
 
 @dataclass(frozen=True)
@@ -182,8 +242,9 @@ class WalkRecord:
 
     @property
     def counts(self) -> dict[str, int]:
-        """The counters of the ray (`Hits.counters`), counted from the steps."""
-        return {name: int(values[0]) for name, values in counted(self.recorded).items()}
+        """The counters of the ray (`Hits.counters`), except its number of rays."""
+        counts = self.recorded.counts[0]
+        return {name: int(counts[name]) for name in counts.dtype.names if name != "probes"}
 
     def __str__(self) -> str:
         width = len(str(len(self)))
@@ -200,31 +261,6 @@ class WalkRecord:
         """Return the walk for JSON."""
         return plain({"structure": self.structure, "origin": self.origin.tolist(), "direction": self.direction.tolist(),
                       "t_min": self.t_min, "t_max": self.t_max, "counts": self.counts, "steps": [step.as_dict() for step in self.steps]})
-
-
-def counted(recorded: RecordedSteps) -> dict[str, np.ndarray]:
-    """Return the counters of each ray, (N,) int64, counted from the steps."""
-    steps, n = recorded.steps, len(recorded)
-    kind, ray = steps["kind"], np.repeat(np.arange(n), np.diff(recorded.first))
-
-    def number(mask: np.ndarray) -> np.ndarray:
-        return np.bincount(ray[mask], minlength=n)
-
-    nodes, primitives = kind == of.NODE, kind == of.TEST
-    tested = (kind == of.BOX) | (kind == of.PLANE) | (kind == of.CELL)
-    before = np.maximum.accumulate(np.where(nodes, np.arange(len(steps)), -1))  # the node of each test; a root's box has none
-    owned = before >= recorded.first[ray] if len(steps) else np.zeros(0, bool)
-    operations = np.zeros(len(steps), bool)
-    operations[before[tested & owned]] = True
-    leaves_stack = (kind == of.POP) & (steps["result"] & of.STAYS == 0)
-    size = np.cumsum((kind == of.PUSH).astype(np.int64) - leaves_stack)
-    stack = np.zeros(n, np.int64)
-    np.maximum.at(stack, ray, size)  # every stack is empty at the end of its ray
-    node_bytes, primitive_bytes = recorded.node_bytes, recorded.primitive_bytes
-    return {"nodes": number(nodes), "boxes": number(kind == of.BOX), "box_operations": number(operations | ((kind == of.BOX) & ~owned)),
-            "primitives": number(primitives), "leaves": number(kind == of.LEAF), "pushes": number(kind == of.PUSH),
-            "pops": number(kind == of.POP), "stack": stack, "node_bytes": node_bytes * number(nodes),
-            "primitive_bytes": primitive_bytes * number(primitives)}
 
 
 def steps_of(walk: WalkRecord) -> list[WalkStep]:

@@ -12,11 +12,10 @@ import wrt
 from tests import device
 from tests.data import data_path
 from tests.structures import STRUCTURES, families_first
-from wrt.accel.queries.observed import record_steps
+from wrt.accel.queries.observed import RecordedSteps, record_steps
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.drawing import section_of
-from wrt.lab.walk.record import Entry, counted
-from wrt.lab.walk.regions import Region
+from wrt.lab.walk.record import Entry, Region
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene, Sphere
@@ -32,6 +31,31 @@ def aimed(mesh: Mesh, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     size = np.linalg.norm(hi - lo)
     origins = 0.5 * (lo + hi) + size * rng.normal(size=(n, 3))
     return origins.astype(np.float32), (lo + (hi - lo) * rng.uniform(-0.1, 1.1, (n, 3)) - origins).astype(np.float32)
+
+
+def counted(recorded: RecordedSteps) -> dict[str, np.ndarray]:
+    """Return the counters of each ray, (N,) int64, counted from the steps."""
+    steps, n = recorded.steps, len(recorded)
+    kind, ray = steps["kind"], np.repeat(np.arange(n), np.diff(recorded.first))
+
+    def number(mask: np.ndarray) -> np.ndarray:
+        return np.bincount(ray[mask], minlength=n)
+
+    nodes, primitives = kind == of.NODE, kind == of.TEST
+    tested = (kind == of.BOX) | (kind == of.PLANE) | (kind == of.CELL)
+    before = np.maximum.accumulate(np.where(nodes, np.arange(len(steps)), -1))  # the node of each test; a root's box has none
+    owned = before >= recorded.first[ray] if len(steps) else np.zeros(0, bool)
+    operations = np.zeros(len(steps), bool)
+    operations[before[tested & owned]] = True
+    leaves_stack = (kind == of.POP) & (steps["result"] & of.STAYS == 0)
+    size = np.cumsum((kind == of.PUSH).astype(np.int64) - leaves_stack)
+    stack = np.zeros(n, np.int64)
+    np.maximum.at(stack, ray, size)  # every stack is empty at the end of its ray
+    node_bytes, primitive_bytes = recorded.node_bytes, recorded.primitive_bytes
+    return {"nodes": number(nodes), "boxes": number(kind == of.BOX), "box_operations": number(operations | ((kind == of.BOX) & ~owned)),
+            "primitives": number(primitives), "leaves": number(kind == of.LEAF), "pushes": number(kind == of.PUSH),
+            "pops": number(kind == of.POP), "stack": stack, "node_bytes": node_bytes * number(nodes),
+            "primitive_bytes": primitive_bytes * number(primitives)}
 
 
 def check_counts(mesh: Mesh, name: str, n: int) -> None:
