@@ -15,26 +15,21 @@ from wrt.kernels.rows import put_int
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct
-from wrt.kernels.traverse.stack import reference_of, t_of
-from wrt.kernels.wide.batch import MIN_VISITS, PACKETS, SLOTS, STOPPED, count_walk, make_interleaved, make_packet_walk
+from wrt.kernels.traverse.stack import reference_of
+from wrt.kernels.wide.batch import (
+    MIN_VISITS,
+    PACKETS,
+    SLOTS,
+    STOPPED,
+    count_walk,
+    make_interleaved,
+    make_packet_walk,
+    make_visit,
+    pop_packet,
+)
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import (
-    ACTIVE,
-    COHERENT,
-    ENTRY,
-    FIELD,
-    LANES,
-    LAYOUT_H,
-    PACKET_SIZE,
-    REFUSED,
-    ROW_SIZE,
-    SLOT,
-    SLOT_SIZE,
-    STACK_WORDS,
-    WIDTH,
-)
-from wrt.kernels.wide.leaves import make_row_test
+from wrt.kernels.wide.layout import ACTIVE, COHERENT, ENTRY, FIELD, LANES, LAYOUT_H, PACKET_SIZE, REFUSED, SLOT, SLOT_SIZE, STACK_WORDS
 from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,
@@ -47,17 +42,14 @@ from wrt.kernels.wide.packets import (
     key_at,
     lowest_of_all,
     make_set_up,
-    make_steps,
     prefetch_next,
-    rays_at,
     rays_meeting_root,
-    rays_reaching,
     slot_at,
     store_bits,
     write_hits,
     write_occluded,
 )
-from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
+from wrt.kernels.wide.references import DONE, EMPTY, leaf_first
 
 Instances = make_struct(WideBvh)
 HEADERS = with_headers("wide/instances.h", layout=LAYOUT_H)
@@ -191,10 +183,7 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
                 visit(accel, surfaces, leaf_first(reference), mask, scratch, base)
             else:
                 size = children(accel, scratch, base, reference, mask, size)
-            mask = int(0)
-            while size > TOP_STACK and mask == 0:
-                size = size - 1
-                mask = rays_at(scratch.stacks, size) & rays_reaching(t_of(key_at(scratch.stacks, size)), scratch, base)
+            mask, size = pop_packet(scratch, base, size, TOP_STACK)
             if mask == 0:
                 break
             reference = reference_of(key_at(scratch.stacks, size))
@@ -238,8 +227,7 @@ def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
 
 def make_turn(units: Units, any_hit: bool, take_hit: Any, descend: Any) -> Any:
     """Return turn, which visits the node or leaf of a slot's ray, and chooses the next one. It returns False if the ray is finished."""
-    test_row = make_row_test(units, any_hit, None, True)
-    _, step, pop = make_steps(any_hit)
+    visit = make_visit(units, any_hit, None)
     top_pop = make_top_steps(any_hit).pop
 
     @wp.func
@@ -247,27 +235,13 @@ def make_turn(units: Units, any_hit: bool, take_hit: Any, descend: Any) -> Any:
         words = slot * SLOT_SIZE
         placement = slot_at(scratch.slots, words + wp.static(SLOT["placement"]))
         bottom = accel.bottoms[accel.placements[placement].bottom]
-        reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
-        finished = bool(False)
-        if reference < 0:
-            ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
-            left = leaf_count(reference)
-            first = leaf_first(reference) * ROW_SIZE
-            while left > 0 and not finished:
-                finished = test_row(bottom, first, wp.min(left, WIDTH), surfaces, scratch, ray)
-                left = left - WIDTH
-                first = first + ROW_SIZE
-            next = int(EMPTY)
-            if not finished:
-                next = pop(bottom, scratch, slot, number(scratch.packets, ray + wp.static(FIELD["t"])))
-        else:
-            next = step(bottom, scratch, slot)
-        if next != EMPTY:
+        next = visit(bottom, surfaces, scratch, slot)
+        if next != EMPTY and next != DONE:
             prefetch_next(bottom, next)
             return True
         ray = slot_at(scratch.slots, words + SLOT_SIZE * SLOTS + wp.static(SLOT["ray"]))
         take_hit(accel, placement, scratch, ray, slot_at(scratch.slots, words + wp.static(SLOT["ray"])))
-        if finished:
+        if next == DONE:
             return False
         return descend(accel, scratch, slot, top_pop(accel, scratch, SLOTS + slot, number(scratch.packets, ray + wp.static(FIELD["t"]))))
 
