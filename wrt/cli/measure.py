@@ -14,7 +14,7 @@ from wrt.lab.bench import Error, Pictures, Queries, Visibility
 from wrt.lab.claims import Claims
 from wrt.lab.hard_cases import Closed, Stability
 from wrt.lab.mitsuba import Mitsuba
-from wrt.lab.rtcore import MODELLED, Float64, RtCore, WhatIf
+from wrt.lab.rtcore import MODELLED, RtCore, WhatIf
 
 BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches", click.Command)
 
@@ -39,7 +39,7 @@ def bench(context: click.Context, quick: bool) -> None:
             command.invoke(each)
 
 
-for plan in (Queries, Visibility, Pictures, Closed, RtCore, Float64, Claims):
+for plan in (Queries, Visibility, Pictures, Closed, RtCore, Claims):
     bench.add_command(measured(plan))
 whatif, stability = measured(WhatIf), measured(Stability)
 

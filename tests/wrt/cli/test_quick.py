@@ -12,7 +12,7 @@ from wrt.lab.bench import Error, Pictures, Queries, Visibility, report
 from wrt.lab.claims import Claims
 from wrt.lab.hard_cases import Closed, Stability, stability
 from wrt.lab.mitsuba import Mitsuba
-from wrt.lab.rtcore import Float64, RtCore, WhatIf
+from wrt.lab.rtcore import RtCore, WhatIf
 
 WITHOUT_FILES = (Queries, Visibility, Closed, Claims)
 
@@ -30,7 +30,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return plans
 
 
-@pytest.mark.parametrize("plan", [*WITHOUT_FILES, Error, Pictures, Stability, Mitsuba, Float64, RtCore, WhatIf])
+@pytest.mark.parametrize("plan", [*WITHOUT_FILES, Error, Pictures, Stability, Mitsuba, RtCore, WhatIf])
 def test_quick_is_less_than_the_default(plan: Any) -> None:
     defaults = {name: plan.__dataclass_fields__[name].default for name in plan.QUICK}
     assert all(plan.QUICK[name] < default for name, default in defaults.items() if not isinstance(default, str | tuple))

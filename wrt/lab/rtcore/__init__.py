@@ -1,4 +1,4 @@
-"""A model of the RT core: counters of ray costs, caches, warps, machine code, and rays a second."""
+"""A model of the RT core: counters of ray costs, caches, warps, and rays a second."""
 
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
@@ -32,18 +32,6 @@ class RtCore(Plan):
     seed: int = the_seed()
     inside: bool = from_inside()
     trace: str = option("", "Write the trace of one mesh, structure and kind of ray to a .npz file  [default: none]")
-
-
-@dataclass(frozen=True)
-class Float64(Plan):
-    """Count the triangle tests on MESHES that need float64. A GPU runs the watertight test. Count the rays with such a test, too."""
-
-    COMMAND, STUDY, QUICK = "bench float64", "wrt.lab.rtcore.hard_tests", {"rays": 1 << 12}
-    meshes: Sequence[Any] = the_meshes(MISSING)
-    kinds: Sequence[str] = the_kinds("primary", "diffuse")
-    rays: int = option(2**16, "Number of rays of each kind", (1, 2**22))
-    seed: int = the_seed()
-    inside: bool = from_inside()
 
 
 @dataclass(frozen=True)
