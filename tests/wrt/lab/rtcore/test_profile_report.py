@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from tests.refused import refused
 from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.profile_report import GROUPS, check_folder, model_rows, warp_order, work_of
+from wrt.lab.rtcore.profile_report import GROUPS, model_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.picture.heatmap import colors, heatmap, short, step_of, top_of
 from wrt.picture.image import read_channels, read_image
@@ -104,15 +103,6 @@ def test_histograms_are_drawn_of_anything() -> None:
     assert picture.shape == (550, 800, 3) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
 
 
-def test_what_cannot_be_written_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with refused(what="output folder"):
-        check_folder(tmp_path / "file")
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with refused(what="plots need matplotlib", hint="pip install \"wrt"):
-        check_folder(tmp_path)
-
-
 def test_the_command_writes_what_it_says(tmp_path: Path, measured: Profile) -> None:
     scene, folder = tmp_path / "mirrors.toml", tmp_path / "out"
     scene.write_text(MIRRORS)
@@ -132,12 +122,3 @@ def test_the_command_writes_what_it_says(tmp_path: Path, measured: Profile) -> N
     for row in told["model"]:
         assert row["low"] <= row["rays_per_second"] <= row["high"] and row["gpu"] == "RTX 2060"
         assert max(row["utilisation"].values()) == 1.0 == row["utilisation"][row["limit"]]
-
-
-def test_what_cannot_be_profiled_is_told_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "mirrors.toml").write_text(MIRRORS)
-    scene = str(tmp_path / "mirrors.toml")
-    for arguments, words in ((("--gpu", "voodoo"), "no GPU 'voodoo'"), (("--accel", "x"), "no structure"),
-                             (("-o", scene), "folder")):
-        result = command("profile", scene, *arguments)
-        assert result.code == 2 and len(result.errors) == 1 and words in result.errors[0]

@@ -140,15 +140,6 @@ def test_a_scene_has_its_own_samples_a_mesh_one_and_progress_ends_at_all_samples
     assert told[-1].done == told[-1].total == 3 * found.spp * found.size[0] * found.size[1] and told[-1].rays == 3 * len(found.rays)
 
 
-def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("aov", "nonsense"):
-        with refused(name, "not an argument"):
-            profile(scene, **{name: "depth"})
-    monkeypatch.setattr("wrt.lab.rtcore.profiler.memory_of", lambda device: 1000.0)
-    with refused(what="million rays"):
-        profile(scene)
-
-
 GUARDS = ("if counting:", "if wp.static(counting):", "if wp.static(features.counting):", "if wp.static(features.recording):")
 
 

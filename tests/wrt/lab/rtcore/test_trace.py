@@ -17,6 +17,7 @@ import pytest
 import wrt
 from tests.command_line import wrt as command
 from tests.data import ROOT, data_path
+from tests.refused import refused
 from tests.structures import families_first
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.rtcore.model import trace_rays
@@ -82,33 +83,13 @@ def test_a_file_keeps_a_trace_and_damage_is_reported(recorded: Trace, tmp_path: 
     (tmp_path / "cut.npz").write_bytes(data[: len(data) // 2])
     arrays: dict[str, Any] = {each.name: getattr(recorded, each.name) for each in fields(Trace)}
     np.savez(tmp_path / "short.npz", **(arrays | {"address": recorded.address[1:]}))
-    np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    for name, message in (("cut", "is not a trace"), ("short", "rows, and must have"), ("other", "is not a trace"),
-                          ("none", "no such file")):
-        with pytest.raises(wrt.InputError, match=message):
+    for name in ("cut", "short", "none"):
+        with pytest.raises(wrt.InputError, match=name):
             Trace.load(tmp_path / f"{name}.npz")
-    changes: list[tuple[dict[str, Any], str]] = [
-        ({"first": recorded.first[::-1]}, "must ascend"), ({"size": 0 * recorded.size}, "at least 1 byte"),
-        ({"test": recorded.test + 9}, "from 0 to 4")]
-    for change, message in changes:
-        with pytest.raises(wrt.InputError, match=message):
-            replace(recorded, **change)
-    with pytest.raises(wrt.InputError, match="must ascend, from 0"):
-        recorded.with_prefetches([len(recorded.address)], [0], [1])
-
-
-def test_wrong_arguments_are_reported() -> None:
-    accel = wrt.build(icosphere(1), "bvh2")
-    for arguments, message in (((icosphere(1), [[0, 0, 3]], [[0, 0, 1]]), "must be a structure"),
-                               ((wrt.build([icosphere(1)], "bvh2"), [[0, 0, 3]], [[0, 0, 1]]), "over instances"),
-                               ((accel, [[0, 0, 3]], [[0, 0, 0]]), "directions"), ((accel, [[0, 0, 3]], [0, 0]), "directions")):
-        with pytest.raises(wrt.InputError, match=message):
-            wrt.trace(*arguments)
-    assert len(wrt.trace(accel, np.zeros((0, 3)), np.zeros((0, 3)))) == 0
-    wrong: list[Any] = [None, "x", 5, []]
-    for origins in wrong:
-        with pytest.raises(wrt.InputError, match="origins must be"):
-            wrt.trace(accel, origins, np.ones((0, 3)))
+    for argument, value in (("first", recorded.first[::-1]), ("address", -recorded.address), ("test", recorded.test + 9)):
+        with refused(argument):
+            replace(recorded, **{argument: value})
+    assert len(wrt.trace(wrt.build(icosphere(1), "bvh2"), np.zeros((0, 3)), np.zeros((0, 3)))) == 0
 
 
 def test_the_model_follows_a_changed_trace(recorded: Trace) -> None:

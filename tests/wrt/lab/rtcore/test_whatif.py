@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,9 @@ import pytest
 
 from tests.command_line import wrt as command
 from tests.kernel_tools import rounded
-from tests.refused import refused
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
-from wrt.accel.scenes.build import build
-from wrt.kernels.study.bvh2_study import STACK_SIZE, Study, child_0_first
+from wrt.kernels.study.bvh2_study import Study, child_0_first
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.report import text
 from wrt.lab.rtcore.parameters import SWEEPS
@@ -154,17 +151,3 @@ def test_the_command(ball: Path, tmp_path: Path) -> None:
     assert [row["differ"] for row in told["rows"]] == [0] * 4 and told["rows"][0]["few_warps"]["rays_per_second"] > 0.0
     assert command("whatif", "nonsense", str(ball)).code == 2
     assert command("whatif", "order", str(tmp_path / "none.obj")).code == 2
-
-
-def test_what_there_is_not_is_refused(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for wrong, words in (({"study": "x"}, ("study", "no study")), ({"kinds": ("x",)}, ("kinds", "no kind")),
-                         ({"gpu": "x"}, ("gpu", "no GPU")),
-                         ({"rays": 0}, ("rays",))):
-        with refused(*words):
-            Plan(**{"study": "order", "mesh": ball, **wrong})  # type: ignore[arg-type]
-    deep = Bvh2(Geometry.of(icosphere(1)))
-    with monkeypatch.context() as patch, refused(what="63 levels deep"):
-        patch.setattr(Bvh2, "stats", replace(deep.stats, depth=63))
-        with_traversal(deep, Study(4))
-    assert with_traversal(deep, Study(STACK_SIZE)).stats.nodes == deep.stats.nodes
-    assert build(icosphere(1), "bvh2").stats.nodes == deep.stats.nodes
