@@ -13,7 +13,7 @@ from wrt.core.device import launch, made_once, start, upload
 from wrt.kernels.shade.cameras import make_camera_rays_kernel
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import CameraKind
-from wrt.scene.far import moved_camera
+from wrt.scene.size import moved_camera
 from wrt.scene.values import type_of
 
 camera_rays_kernel = made_once(make_camera_rays_kernel)

@@ -23,9 +23,9 @@ from wrt.renderer.film import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROUP, GROU
 from wrt.renderer.launches import WaveKernels, wave_kernels
 from wrt.renderer.options import Options
 from wrt.scene.cameras import CameraKind
-from wrt.scene.far import moved_by, moved_camera, scene_origin
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
+from wrt.scene.size import moved_by, moved_camera, scene_origin
 
 # Settings that the kernels do not depend on.
 AIMED = ("size", "spp", "max_depth", "min_throughput", "clamp", "exposure", "tonemap", "auto_exposure")

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.scene.exact import whole_numbers
 
 AT_ONCE = 1 << 15  # faces of one batch, whose float64 temporaries fit in the processor's cache
 ROUNDS = 64  # largest number of rounds of flips
@@ -100,6 +99,19 @@ def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray
         e, f = ([x - y for x, y in zip(corner, p, strict=True)] for corner in (q, r))
         out[rows] = np.any([e[i] * f[j] != e[j] * f[i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=0)
     return out
+
+
+def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
+    """Return each (3, N) array of float32 values as 3 object arrays of Python ints, and the exponent k of all arrays: value = int * 2^k."""
+    parts = [np.frexp(array) for array in arrays]
+    used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
+    k = min((int(e.min()) for e in used if e.size), default=0) - 24
+    out = []
+    for mantissa, exponent in parts:
+        whole = (mantissa * 2.0**24).astype(np.int64).astype(object)
+        shift = np.where(mantissa != 0.0, exponent - 24 - k, 0).astype(object)
+        out.append(list(whole << shift))
+    return out, k
 
 
 def merged(vertices: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry, InstancedGeometry, Nu
 from wrt.accel.scenes.instancing import is_instance, is_invertible
 from wrt.core.errors import InputError
 from wrt.scene.clean import flip_collinear
-from wrt.scene.far import moved_by, scene_origin
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
+from wrt.scene.size import moved_by, scene_origin
 
 MOST = 2**31 - 2  # faces, and vertices
 

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.scene.exact import Crossings
+from wrt.lab.oracle.exact import Crossings
 
 UNIT_32 = 2.0**-24
 TINY_32 = 2.0**-149

@@ -3,7 +3,7 @@
 A ray o + t d, with t in the closed segment [t_min, t_max], hits a triangle if it meets the closed triangle and is not parallel to its
 plane. So a ray in the plane does not hit, and a triangle without area or with a coordinate that is not finite is never hit. A sphere is
 hit where the ray enters and where it leaves, or once where the ray only touches it. Both sides of a surface count. Coordinates are float32
-values, treated as exact. `wrt.scene.exact` explains how signs are decided, and `wrt.lab.oracle.bounds` bounds the errors of float32 tests.
+values, treated as exact. `exact` beside it explains how signs are decided, and `bounds` bounds the errors of float32 tests.
 
 >>> answer = closest(mesh, origins, directions)         # mesh: anything with vertices, faces and perhaps spheres
 >>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t"""
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt.lab.oracle.bounds import Bounds, sphere_bounds, sure, triangle_bounds
-from wrt.scene.exact import UNIT, Crossings, Place, SphereCrossings, exact_plane, sphere_crossings, triangle_crossings
+from wrt.lab.oracle.exact import UNIT, Crossings, Place, SphereCrossings, exact_plane, sphere_crossings, triangle_crossings
 
 __all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "closest", "reference_of", "sure", "t_bound"]
 
@@ -45,7 +45,7 @@ AllHits = Any  # np.recarray, whose stubs do not know its attributes
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The closest hit of each ray, arrays (N,).
-    - t, u, v: float64, t inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, a wrt.scene.exact.Place.
+    - t, u, v: float64, t inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, a Place.
     - tie: flags of rays that hit several primitives at exactly this t; ties: index of such a ray -> the primitives' prim_id, ascending."""
 
     t: np.ndarray

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from wrt.lab.oracle.bounds import triangle_bounds
+from wrt.lab.oracle.exact import sphere_crossings, triangle_crossings
 from wrt.lab.oracle.oracle import Place, Reference, closest, reference_of, sure, t_bound
-from wrt.scene.exact import sphere_crossings, triangle_crossings
 
 Row = list[Fraction]
 

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from wrt.scene.clean import whole_numbers
+
 UNIT = 2.0**-53  # unit roundoff of float64
 ACCURATE = 1e-14  # larger errors, relative in t and absolute in u and v, are recomputed in integers
 
@@ -66,19 +68,6 @@ def _triple(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np
 
 def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
     return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0]))
-
-
-def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
-    """Return each (3, N) array of float32 values as 3 object arrays of Python ints, and the exponent k of all arrays: value = int * 2^k."""
-    parts = [np.frexp(array) for array in arrays]
-    used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
-    k = min((int(e.min()) for e in used if e.size), default=0) - 24
-    out = []
-    for mantissa, exponent in parts:
-        whole = (mantissa * 2.0**24).astype(np.int64).astype(object)
-        shift = np.where(mantissa != 0.0, exponent - 24 - k, 0).astype(object)
-        out.append(list(whole << shift))
-    return out, k
 
 
 def exact_plane(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> tuple[Any, Any, Any, int]:
