@@ -224,9 +224,11 @@ def test_a_click_tells_the_surface_the_rays_and_the_walk(page: Any) -> None:
             mean = mean + (page.rays.shown.sample.radiance - mean) / np.float32(i + 1)  # the film's running mean
         np.testing.assert_array_equal(mean, page.viewer.film.pixels[y, x])
         somebody.move(0.1)  # the rays stay at their places in the scene
-        first = done(somebody)["overlay"][-len(page.rays.shown.sample.rays)]
-        expected = place_of(page.viewer.view.camera, (64, 48), page.rays.shown.sample.root.end.astype(float))
-        np.testing.assert_allclose(first["ends"][2:], np.divide(expected, (64, 48)), atol=1e-3)
+        wait(lambda: page.viewer.view.camera is not view.camera)
+        traced = page.rays.shown.sample
+        expected = np.divide(place_of(page.viewer.view.camera, (64, 48), traced.root.end.astype(float)), (64, 48))
+        somebody.until(lambda message: message["type"] == "picture" and message["overlay"] and np.allclose(
+            message["overlay"][-len(traced.rays)]["ends"][2:], expected, atol=1e-3))
         origins, directions = film_rays(view.camera, view.size, np.array([[(x + 0.5) / 64, (y + 0.5) / 48]]))
         steps = wrt.walk(page.viewer.renderers.prepared(view).accel, origins[0], directions[0]).steps
         for asked, step in ((0, 0), (1, 1), (999, len(steps) - 1)):
