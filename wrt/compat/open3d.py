@@ -16,11 +16,12 @@ from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.all_hits import ListQuery
+from wrt.accel.queries.answers import ANY_HIT_TYPES
 from wrt.accel.queries.lists import begins
 from wrt.accel.queries.raw_launches import RowKernel
 from wrt.accel.queries.rays import constant, vectors
 from wrt.compat.joined_meshes import JoinedMeshes
-from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, scatter
+from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, scatter, traced
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
@@ -121,9 +122,8 @@ class RaycastingScene:
         scene = self._scene()
         shape, rows = _rows(rays, "rays", 6, scene.origin)
         threads = _threads(nthreads)
-        hits = scene.accel.closest_hit(*_split(rows, threads), threads)
-        return _answers({"t_hit": hits.t, **scene.found(hits.prim_id, hits.u, hits.v),
-                         "primitive_normals": scene.normals.take(hits.prim_id, 0)}, shape)
+        t, u, v, prim_id = traced(scene.accel, _split(rows, threads), threads)
+        return _answers({"t_hit": t, **scene.found(prim_id, u, v), "primitive_normals": scene.normals.take(prim_id, 0)}, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
         """Test whether each ray hits anything: (...) bool.
@@ -137,7 +137,7 @@ class RaycastingScene:
         accel, (shape, rows) = scene.accel, _rows(rays, "rays", 6, scene.origin)
         origins, directions, t_min, t_max = _split(rows, threads)
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
-            return _answer(accel.any_hit(origins, directions, t_min, t_max, threads), shape)
+            return _answer(traced(accel, (origins, directions, t_min, t_max), threads, ANY_HIT_TYPES)[0], shape)
         near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
         end = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
         hit = accel.any_hit(origins, directions, np.fmax(near, np.float32(0.0)), np.minimum(t_max, end), threads)

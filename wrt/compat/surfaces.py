@@ -1,5 +1,6 @@
 """All hits of rays, counted as in other libraries: a ray through an edge or a corner of a surface hits the surface once."""
 
+from collections.abc import Mapping
 from typing import TypeAlias
 
 import numpy as np
@@ -7,10 +8,21 @@ import numpy as np
 from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
-from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.answers import HIT_TYPES, Hits
+from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.rays import Rays
 
 NumpyRays: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # origins, directions, t_min and t_max, as in Rays
+
+
+def traced(accel: Accelerator, rays: NumpyRays, threads: int, types: Mapping[str, np.dtype] = HIT_TYPES) -> list[np.ndarray]:
+    """Return t, u, v and prim_id of the closest hits of valid rays, or with ANY_HIT_TYPES whether each ray hits anything.
+
+    It leaves out the checks of `closest_hit` and `any_hit`, which take as long as the query of a ray.
+    """
+    out = [np.empty(len(rays[3]), dtype) for dtype in types.values()]
+    trace_query(accel.snapshot, Query(Rays(*rays), out, threads))
+    return out
 
 
 def every_hit(accel: Accelerator, rays: NumpyRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:

@@ -14,11 +14,11 @@ import warp as wp
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.points.enclosing import enclosing
-from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.answers import ANY_HIT_TYPES
 from wrt.accel.queries.raw_launches import RowKernel
 from wrt.accel.queries.rays import constant
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts
+from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, traced
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -113,12 +113,12 @@ class RayMeshIntersector:
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
         scaled = self.scaled
-        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions)).prim_id)
+        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions))[3])
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
         scaled = self.scaled
-        return scaled.accel.any_hit(*scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)
+        return traced(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads, ANY_HIT_TYPES)[0]
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool; False for points that are not finite.
@@ -198,15 +198,15 @@ class _ScaledStructure:
         origins, directions, t_max = PLACE_RAYS.rows(n, (origins, directions), self.placement, threads=self.threads)
         return origins, directions, constant(0.0, n), t_max
 
-    def closest_hits(self, *rays: np.ndarray) -> Hits[np.ndarray]:
-        """Return the closest hit of each ray. rays: origins and directions."""
-        return self.accel.closest_hit(*self.placed(*rays), self.threads)
+    def closest_hits(self, *rays: np.ndarray) -> list[np.ndarray]:
+        """Return t, u, v and prim_id of the closest hit of each ray. rays: origins and directions."""
+        return traced(self.accel, self.placed(*rays), self.threads)
 
     def first_hit(self, *rays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        hits = self.closest_hits(*rays)
-        hit = np.flatnonzero(hits.prim_id >= 0)
-        return hit, hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
+        _, u, v, prim_id = self.closest_hits(*rays)
+        hit = np.flatnonzero(prim_id >= 0)
+        return hit, prim_id[hit].astype(np.int64), u[hit], v[hit]
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""

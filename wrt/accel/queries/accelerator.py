@@ -248,20 +248,20 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
            invalid: str = "raise") -> tuple[Query, Shape | None, Callable[[Any], Any] | None]:
     """Return the query of a call, the shape of its results, and the function that converts them to the caller's library.
 
-    Shape and function are None for NumPy arrays (N, 3), the usual call. types: of the results, of which only hits have gradients; `rays`:
-    the caller's origins, directions, t_min and t_max; other arguments: see `Accelerator.closest_hit`.
+    Shape and function are None in the usual call: NumPy arrays (N, 3), or Warp arrays (N,). types: of the results, of which only hits have
+    gradients; `rays`: the caller's origins, directions, t_min and t_max; other arguments: see `Accelerator.closest_hit`.
     """
     if threads is not None:
         threads = thread_count(threads)
     origin, gradients = snapshot.geometry.origin, types is HIT_TYPES
     if are_rows(rays[0], rays[1]) and invalid == "raise":
-        valid, shape, give, device = rays_of(*rays, gradients, origin), None, None, None
+        valid, shape, give = rays_of(*rays, gradients, origin), None, None
     else:
         valid, shape = shaped_rays(*rays, gradients, invalid, origin)
-        give, device = to_tensor_like(*rays[:2]), snapshot.device if valid.as_warp else None
+        give = to_tensor_like(*rays[:2])
         out, world = out and flat_arrays(out, shape, types), worlds_of_each(world, shape)
     n = len(valid.origins)
-    arrays = answer_arrays(types, out, n, device, give is not None)
+    arrays = answer_arrays(types, out, n, snapshot.device if valid.as_warp else None, give is not None)
     return Query(valid, arrays, threads, check_world(snapshot, world, n), tiled_width(shape) if shape else 0), shape, give
 
 

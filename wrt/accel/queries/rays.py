@@ -109,9 +109,11 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
 
 
 def are_rows(origins: object, directions: object) -> bool:
-    """Return whether both arguments are NumPy arrays of one shape (N, ...), the usual case."""
-    return (type(origins) is np.ndarray and type(directions) is np.ndarray and origins.ndim == 2
-            and origins.shape == directions.shape)
+    """Return whether `rays_of` takes both arguments as they are: NumPy arrays of one shape (N, ...), or Warp arrays (N,) of vec3."""
+    if type(origins) is np.ndarray and type(directions) is np.ndarray:
+        return origins.ndim == 2 and origins.shape == directions.shape
+    return (isinstance(origins, wp.array) and isinstance(directions, wp.array) and origins.dtype == directions.dtype == wp.vec3
+            and origins.ndim == 1 and origins.shape == directions.shape)
 
 
 def is_valid(origins: np.ndarray, directions: np.ndarray, t_min: np.ndarray, t_max: np.ndarray) -> np.ndarray:
