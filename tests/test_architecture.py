@@ -97,10 +97,10 @@ LONG_FUNCTIONS = 9  # Functions with more than 60 lines.
 LONG_SIGNATURES = 5  # Functions with more than 7 parameters: public queries, all of which take `world`.
 # Lines of each folder of wrt and kernels, with headers. A commit may lower an entry, or raise one and lower others by as much.
 MOST_LINES = {
-    "kernels": 1592, "kernels/build": 3857, "kernels/loops": 1926, "kernels/shade": 4105, "kernels/study": 1494,
-    "kernels/traverse": 2355, "kernels/units": 815, "kernels/wide": 3810, "wrt": 386, "wrt/accel": 9713, "wrt/cli": 1529,
-    "wrt/compat": 1157, "wrt/core": 2269, "wrt/io": 4288, "wrt/lab": 10_745, "wrt/picture": 1202, "wrt/renderer": 4281,
-    "wrt/scene": 2935, "wrt/sensors": 808, "wrt/viewer": 1866,
+    "kernels": 1583, "kernels/build": 3237, "kernels/loops": 1767, "kernels/shade": 4063, "kernels/study": 668,
+    "kernels/traverse": 2063, "kernels/units": 815, "kernels/wide": 3800, "wrt": 371, "wrt/accel": 8902, "wrt/cli": 1442,
+    "wrt/compat": 957, "wrt/core": 2022, "wrt/io": 3736, "wrt/lab": 8318, "wrt/picture": 1184, "wrt/renderer": 3617,
+    "wrt/scene": 2849, "wrt/sensors": 806, "wrt/viewer": 1469,
 }
 
 
