@@ -16,12 +16,12 @@ from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.answers import ANY_HIT_TYPES
+from wrt.accel.queries.batches import MadeRays, trace_made
 from wrt.accel.queries.lists import begins
 from wrt.accel.queries.raw_launches import RowKernel
-from wrt.accel.queries.rays import constant, vectors
+from wrt.accel.queries.rays import vectors
 from wrt.compat.joined_meshes import JoinedMeshes
-from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, scatter, traced
+from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
@@ -122,7 +122,7 @@ class RaycastingScene:
         scene = self._scene()
         shape, rows = _rows(rays, "rays", 6, scene.origin)
         threads = _threads(nthreads)
-        t, u, v, prim_id = traced(scene.accel, _split(rows, threads), threads)
+        t, u, v, prim_id = trace_made(scene.accel.snapshot, _split(rows), False, threads)
         return _answers({"t_hit": t, **scene.found(prim_id, u, v), "primitive_normals": scene.normals.take(prim_id, 0)}, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
@@ -135,9 +135,9 @@ class RaycastingScene:
         """
         threads, scene = _threads(nthreads), self._scene()
         accel, (shape, rows) = scene.accel, _rows(rays, "rays", 6, scene.origin)
-        origins, directions, t_min, t_max = _split(rows, threads)
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
-            return _answer(traced(accel, (origins, directions, t_min, t_max), threads, ANY_HIT_TYPES)[0], shape)
+            return _answer(trace_made(accel.snapshot, _split(rows), True, threads)[0], shape)
+        origins, directions, t_min, t_max = _split(rows).rays(threads)
         near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
         end = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
         hit = accel.any_hit(origins, directions, np.fmax(near, np.float32(0.0)), np.minimum(t_max, end), threads)
@@ -149,7 +149,7 @@ class RaycastingScene:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
         threads, scene = _threads(nthreads), self._scene()
         shape, rows = _rows(rays, "rays", 6, scene.origin)
-        return _answer(hit_counts(scene.accel, _split(rows, threads), threads).astype(np.int32), shape)
+        return _answer(hit_counts(scene.accel, _split(rows).rays(threads), threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -162,7 +162,7 @@ class RaycastingScene:
         """
         scene, threads = self._scene(), _threads(nthreads)
         rows = _rows(rays, "rays", 6, scene.origin)[1]
-        ray, face, t, u, v = every_hit(scene.accel, _split(rows, threads), threads)
+        ray, face, t, u, v = every_hit(scene.accel, _split(rows).rays(threads), threads)
         splits = begins(np.bincount(ray, minlength=len(rows)))
         return _answers({"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
                          **scene.found(face, u, v)})
@@ -299,12 +299,13 @@ def _finite(array: np.ndarray, name: str) -> np.ndarray:
     return valid
 
 
-def _split(rows: np.ndarray, threads: int) -> NumpyRays:
-    """Return the rays of rows of six. Rays that hit nothing have t_max = -inf. Raises InputError for origins beyond FARTHEST."""
-    origins, directions, t_max = SPLIT_RAYS.rows(len(rows), (rows,), threads=threads)
-    if np.count_nonzero(t_max == FAR_AWAY):
-        _finite(rows, "rays")
-    return origins, directions, constant(0.0, len(rows)), t_max
+def _split(rows: np.ndarray) -> MadeRays:
+    """Return the rays of rows of six. Rays that hit nothing have t_max = -inf. They raise InputError for origins beyond FARTHEST."""
+    def check(t_max: np.ndarray) -> None:
+        if np.count_nonzero(t_max == FAR_AWAY):
+            _finite(rows, "rays")
+
+    return MadeRays(SPLIT_RAYS, (rows,), (), check)
 
 
 def _answers(found: dict[str, np.ndarray], shape: tuple[int, ...] | None = None) -> dict[str, Answer]:

@@ -1,41 +1,25 @@
 """All hits of rays, counted as in other libraries: a ray through an edge or a corner of a surface hits the surface once."""
 
-from collections.abc import Mapping
-from typing import TypeAlias
-
 import numpy as np
 
 from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
-from wrt.accel.queries.answers import HIT_TYPES, Hits
-from wrt.accel.queries.batches import Query, trace_query
+from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.rays import Rays
 
-NumpyRays: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # origins, directions, t_min and t_max, as in Rays
 
-
-def traced(accel: Accelerator, rays: NumpyRays, threads: int, types: Mapping[str, np.dtype] = HIT_TYPES) -> list[np.ndarray]:
-    """Return t, u, v and prim_id of the closest hits of valid rays, or with ANY_HIT_TYPES whether each ray hits anything.
-
-    It leaves out the checks of `closest_hit` and `any_hit`, which take as long as the query of a ray.
-    """
-    out = [np.empty(len(rays[3]), dtype) for dtype in types.values()]
-    trace_query(accel.snapshot, Query(Rays(*rays), out, threads))
-    return out
-
-
-def every_hit(accel: Accelerator, rays: NumpyRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
+def every_hit(accel: Accelerator, rays: Rays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
     """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` per ray. rays: see ListQuery.of_valid.
 
     A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first touched face. If
     the mesh is closed, that ray hits up to two touched faces, the nearest ones, as entry and exit.
     """
-    query = ListQuery(accel, threads, crossings=True).of_valid(Rays(*rays))
+    query = ListQuery(accel, threads, crossings=True).of_valid(rays)
     crossed = query.all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
     if len(rest := np.flatnonzero(query.touches)):
-        touched = _touched(accel, Rays(*rays).of(rest), threads)
+        touched = _touched(accel, rays.of(rest), threads)
         row, column = np.nonzero(touched.prim_id >= 0)
         more = rest[row], *(array[row, column] for array in (touched.prim_id, touched.t, touched.u, touched.v))
         found = [np.concatenate(pair) for pair in zip(found, more, strict=True)]
@@ -44,12 +28,12 @@ def every_hit(accel: Accelerator, rays: NumpyRays, threads: int, limit: int = AL
     return tuple(found)
 
 
-def hit_counts(accel: Accelerator, rays: NumpyRays, threads: int) -> np.ndarray:
+def hit_counts(accel: Accelerator, rays: Rays, threads: int) -> np.ndarray:
     """Return the number of hits of each ray in `every_hit`, (N,) int64."""
-    query = ListQuery(accel, threads, crossings=True).of_valid(Rays(*rays))
+    query = ListQuery(accel, threads, crossings=True).of_valid(rays)
     counts = query.counts()
     if len(rest := np.flatnonzero(query.touches)):
-        counts[rest] = (_touched(accel, Rays(*rays).of(rest), threads).prim_id >= 0).sum(axis=1)
+        counts[rest] = (_touched(accel, rays.of(rest), threads).prim_id >= 0).sum(axis=1)
     return counts
 
 

@@ -14,11 +14,10 @@ import warp as wp
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.points.enclosing import enclosing
-from wrt.accel.queries.answers import ANY_HIT_TYPES
+from wrt.accel.queries.batches import MadeRays, trace_made
 from wrt.accel.queries.raw_launches import RowKernel
-from wrt.accel.queries.rays import constant
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import NumpyRays, every_hit, hit_counts, traced
+from wrt.compat.surfaces import every_hit, hit_counts
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -113,12 +112,12 @@ class RayMeshIntersector:
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
         scaled = self.scaled
-        return scaled.given(scaled.closest_hits(*_rays(ray_origins, ray_directions))[3])
+        return scaled.given(scaled.traced(*_rays(ray_origins, ray_directions))[3])
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
         scaled = self.scaled
-        return traced(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads, ANY_HIT_TYPES)[0]
+        return scaled.traced(*_rays(ray_origins, ray_directions), any_hit=True)[0]
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool; False for points that are not finite.
@@ -192,25 +191,23 @@ class _ScaledStructure:
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
 
-    def placed(self, origins: np.ndarray, directions: np.ndarray) -> NumpyRays:
-        """Move and scale rays to the place of the structure, and round them to float32."""
-        n = len(origins)
-        origins, directions, t_max = PLACE_RAYS.rows(n, (origins, directions), self.placement, threads=self.threads)
-        return origins, directions, constant(0.0, n), t_max
+    def placed(self, *rays: np.ndarray) -> MadeRays:
+        """Move and scale rays, origins and directions, to the place of the structure, and round them to float32."""
+        return MadeRays(PLACE_RAYS, rays, (self.placement,))
 
-    def closest_hits(self, *rays: np.ndarray) -> list[np.ndarray]:
-        """Return t, u, v and prim_id of the closest hit of each ray. rays: origins and directions."""
-        return traced(self.accel, self.placed(*rays), self.threads)
+    def traced(self, *rays: np.ndarray, any_hit: bool = False) -> list[np.ndarray]:
+        """Return t, u, v and prim_id of the closest hit of each ray, or whether it hits anything. rays: origins and directions."""
+        return trace_made(self.accel.snapshot, self.placed(*rays), any_hit, self.threads)
 
     def first_hit(self, *rays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        _, u, v, prim_id = self.closest_hits(*rays)
+        _, u, v, prim_id = self.traced(*rays)
         hit = np.flatnonzero(prim_id >= 0)
         return hit, prim_id[hit].astype(np.int64), u[hit], v[hit]
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
-        ray, face, _, u, v = every_hit(self.accel, self.placed(origins, directions), self.threads, limit)
+        ray, face, _, u, v = every_hit(self.accel, self.placed(origins, directions).rays(self.threads), self.threads, limit)
         return ray, face.astype(np.int64), u, v
 
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
@@ -240,7 +237,8 @@ class _Counter(NamedTuple):
                             multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
         """Return the ray of each hit, (M,) int64, in the second place."""
         scaled = self.scaled
-        counts = np.minimum(hit_counts(enclosing(scaled.accel), scaled.placed(origins, directions), scaled.threads), MAX_HITS)
+        rays = scaled.placed(origins, directions).rays(scaled.threads)
+        counts = np.minimum(hit_counts(enclosing(scaled.accel), rays, scaled.threads), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 

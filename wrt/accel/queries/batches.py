@@ -1,6 +1,6 @@
 """Kernel launches of a query, on CPU threads or a GPU. Some structures have a CPU kernel that traces many rays at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
-from wrt.accel.queries.raw_launches import SMALL, raw_launch
-from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.raw_launches import SMALL, FewRows, RowKernel, raw_launch
+from wrt.accel.queries.rays import Rays, constant, rays_on
 from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
@@ -48,6 +48,39 @@ class Query(NamedTuple):
     threads: int | None
     worlds: WorldIds | None = None
     width: int = 0
+
+
+class MadeRays(NamedTuple):
+    """N rays that a kernel makes from rows of the caller, as in adapters for other libraries.
+
+    kernel: computes origins and directions (N, 3) and t_max (N,) from `given` and `inputs`; t_min is 0. check: gets t_max before the
+    rays are traced, and may raise InputError.
+    """
+
+    kernel: RowKernel
+    given: Sequence[np.ndarray]
+    inputs: Sequence[object] = ()
+    check: Callable[[np.ndarray], None] | None = None
+
+    def rays(self, threads: int) -> Rays:
+        n = len(self.given[0])
+        origins, directions, t_max = self.kernel.rows(n, self.given, *self.inputs, threads=threads)
+        if self.check:
+            self.check(t_max)
+        return Rays(origins, directions, constant(0.0, n), t_max)
+
+
+def trace_made(snapshot: Snapshot, made: MadeRays, any_hit: bool, threads: int) -> list[np.ndarray]:
+    """Return t, u, v and prim_id of the closest hits, or with `any_hit` whether each ray hits anything.
+
+    It leaves out the checks of `closest_hit` and `any_hit`. The rays of a small query are made in the buffers of a worker.
+    """
+    n = len(made.given[0])
+    if n <= SMALL and snapshot.device.is_cpu and has_stream(snapshot.structure):
+        return tracer(snapshot.structure, any_hit).workers.run(lambda worker: worker.trace_made(snapshot, made, n))
+    out = [np.empty(n, dtype) for dtype in (ANY_HIT_TYPES if any_hit else HIT_TYPES).values()]
+    trace_query(snapshot, Query(made.rays(threads), out, threads))
+    return out
 
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
@@ -183,6 +216,7 @@ class Worker:
         if tracer.rays is WorldRays:
             self.rays.append(np.empty(BUFFERED, np.int32))
         self.packed = pack(tracer.rays, self.rays, self.results)
+        self.makers: dict[RowKernel, FewRows] = {}  # which write into self.rays
 
     def trace(self, snapshot: Snapshot, rays: Sequence[np.ndarray], results: Sequence[np.ndarray], width: int = 0) -> bool:
         """Trace at most BUFFERED rays by means of the buffers, in tiles if `width` is not 0. Return whether a ray was refused.
@@ -205,6 +239,19 @@ class Worker:
             else:
                 result[:] = found[:n]
         return refused
+
+    def trace_made(self, snapshot: Snapshot, made: MadeRays, n: int) -> list[np.ndarray]:
+        """Trace n rays, at most SMALL, and return the results."""
+        origins, directions, t_min, t_max, *_ = self.rays
+        maker = self.makers.get(made.kernel)
+        if maker is None:
+            maker = self.makers[made.kernel] = FewRows(made.kernel, (origins, directions, t_max))
+        maker.compute(n, made.given, made.inputs)
+        if made.check:
+            made.check(t_max[:n])
+        t_min[:n] = 0.0
+        self.launch(snapshot, self.packed, 0, n)
+        return [found[:n].copy() for found in self.results]
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> bool:
         """Trace the rays [first, end) of `packed`, from `pack`. Return whether one of them was refused, because it is invalid."""

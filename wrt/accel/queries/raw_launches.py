@@ -102,7 +102,7 @@ class RowKernel:
         self.kernel, self.given, self.step = kernel, given, step
         *self.types, self.struct, _ = argument_types(kernel)
         self.row_types = [row_type(field.dtype) for field in fields_of(self.struct).values()]
-        self._free = FreeList(lambda: _FewRows(self))
+        self._free = FreeList(lambda: FewRows(self))
 
     def rows(self, n: int, given: Sequence[np.ndarray], *inputs: object, threads: int = 1) -> list[np.ndarray]:
         """Return the computed arrays, of n rows each. inputs: records or structs, the kernel's arguments before the struct."""
@@ -114,18 +114,22 @@ class RowKernel:
         return out
 
 
-class _FewRows:
-    """Buffers of SMALL rows and a recorded launch of a RowKernel. One thread uses it at a time."""
+class FewRows:
+    """Buffers of SMALL rows and a recorded launch of a RowKernel. One thread uses it at a time.
 
-    def __init__(self, kernel: RowKernel) -> None:
+    out: buffers for the computed rows, of at least SMALL rows; None for new ones.
+    """
+
+    def __init__(self, kernel: RowKernel, out: Sequence[np.ndarray] | None = None) -> None:
         buffers = [np.empty((SMALL, *kind.shape), kind.base) for kind in kernel.row_types]
-        self.given, self.out = buffers[:kernel.given], buffers[kernel.given:]
+        self.given, self.out = buffers[:kernel.given], out or buffers[kernel.given:]
         self.inputs: list[object] = [None] * len(kernel.types)  # of the last launch
         unset = (None if isinstance(kind, wp.array) else kind() for kind in kernel.types)
         self.launch = raw_launch(kernel.kernel, *unset, kernel.struct(), 0)
-        self.launch.set(len(self.inputs), struct_record(kernel.struct, buffers))
+        self.launch.set(len(self.inputs), struct_record(kernel.struct, [*self.given, *self.out]))
 
-    def rows(self, n: int, given: Sequence[np.ndarray], inputs: Sequence[object]) -> list[np.ndarray]:
+    def compute(self, n: int, given: Sequence[np.ndarray], inputs: Sequence[object]) -> None:
+        """Compute the first n rows of `out`."""
         for buffer, array in zip(self.given, given, strict=True):
             buffer[:len(array)] = array
         for i, value in enumerate(inputs):
@@ -135,6 +139,9 @@ class _FewRows:
                 self.inputs[i] = record
         self.launch.set_dim(n)
         self.launch.launch()
+
+    def rows(self, n: int, given: Sequence[np.ndarray], inputs: Sequence[object]) -> list[np.ndarray]:
+        self.compute(n, given, inputs)
         return [array[:n].copy() for array in self.out]
 
 
