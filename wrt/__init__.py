@@ -9,7 +9,7 @@ FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; Constant
 EnvironmentBackground.
 Costs of a picture: profile. All rays of a pixel: inspect. Steps of rays through a structure: walk, trace.
 Errors and warnings: InputError, SceneWarning.
-Further modules: sensors, compat (trimesh, open3d), testing.
+Further modules: sensors, compat (trimesh, open3d, pyvista), testing.
 """
 
 import ast
