@@ -53,7 +53,7 @@ class Access:
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
         pairs = parse_qsl(query, keep_blank_values=True)
-        others = urlencode([pair for pair in pairs if pair[0] != "token"])
+        others = urlencode([pair for pair in pairs if pair[0] != "token"], errors="replace")
         page = f"{self.token}/" + (f"?{others}" if others else "")
         if path.startswith("/") and self._is_token(first):
             return "/" + rest, "" if slash else page

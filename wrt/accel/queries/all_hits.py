@@ -180,13 +180,14 @@ class ListQuery:
             self.touches = np.zeros(self.n, bool)
 
         def find(lists: Any, i: int) -> None:  # HostLists or GpuLists
-            some = slice(firsts[i], firsts[i] + step)
+            some = slice(firsts[i], min(firsts[i] + step, self.n))  # Warp arrays refuse a larger end
             counts = lists.find(self.snapshot, [array[some] for array in self.rays], None if self.roots is None else self.roots[some],
                                 min(limit, ALL), self.mesh, counting)
             if self.crossings:
                 self.touches[some] = counts < 0
                 counts = np.maximum(counts, 0)
             out[i] = take(lists, firsts[i], counts.astype(np.int64))
+            lists.kept = ()
 
         if self.device.is_cpu:
             free = host_lists(self.snapshot.structure)

@@ -164,7 +164,7 @@ class GpuLists:
     """Lists of a batch of rays on a GPU, in new arrays. Methods as those of HostLists."""
 
     def __init__(self, device: Device) -> None:
-        self.device = device
+        self.device, self.kept = device, ()
 
     def find(self, snapshot: Snapshot, rays: Sequence[WarpArray], roots: np.ndarray | None, limit: int, mesh: Mesh,
              counting: bool) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -331,3 +332,17 @@ def judged(case: HardCase) -> None:
     same = np.diff(found.ray_id) == 0
     later = (found.t[1:] > found.t[:-1]) | ((found.t[1:] == found.t[:-1]) & (found.prim_id[1:] > found.prim_id[:-1]))
     assert later[same].all()
+
+
+def test_long_lists_give_their_memory_back() -> None:
+    walls = wrt.build(shapes.merged([shapes.quad((-1, -1, z), (2, 0, 0), (0, 2, 0)) for z in range(200)], "walls"))
+    origins = np.random.default_rng(1).uniform(-0.9, 0.9, (2000, 3)) * (1, 1, 0) - (0, 0, 1)
+    wrt.all_hits(walls, origins[:1], (0.0, 0.0, 1.0))  # makes the buffers that stay
+    tracemalloc.start()
+    try:
+        found = wrt.all_hits(walls, origins, (0.0, 0.0, 1.0))
+        assert len(found.t) >= 200 * len(origins)
+        del found
+        assert tracemalloc.get_traced_memory()[0] < 1e6
+    finally:
+        tracemalloc.stop()
