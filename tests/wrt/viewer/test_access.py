@@ -117,7 +117,8 @@ FORGED = [  # target and headers; ME: the viewer's host and port, TOKEN: its tok
     ("/?token=TOKEN", ["Host: ME", "Origin: http://ME", "Origin: http://evil.example"]), ("/?token=TOKEN", ["Host: ME", "Origin:"]),
     ("/", ["Host: ME"]), ("/?token=wrong", ["Host: ME"]), ("/?token=TOKENx", ["Host: ME"]), ("/wrong/", ["Host: ME"]),
     ("/?token=TOKEN&token=TOKEN", ["Host: ME"]), ("//TOKEN/", ["Host: ME"]), ("/x/TOKEN/", ["Host: ME"]),
-    ("/?a=\udcff", ["Host: ME"]), ("/" + "a" * 5000, ["Host: ME"]), ("/", ["Host: ME", "Cookie: token=TOKEN"]), ("/", ["Host: ME", "Referer: http://ME/?token=TOKEN"]),
+    ("/?a=\udcff", ["Host: ME"]), ("/" + "a" * 5000, ["Host: ME"]),
+    ("/", ["Host: ME", "Cookie: token=TOKEN"]), ("/", ["Host: ME", "Referer: http://ME/?token=TOKEN"]),
 ]
 
 
