@@ -7,7 +7,7 @@ namespace wrt {
 // Return a number not above the squared distance from any point within `blur` of p, along each axis, to each of the boxes lo .. hi. Rounding
 // is covered by a factor and, where squares underflow, by a bound of 0. A plane NaN bounds nothing.
 template <class T> WRT_INLINE T squared_bounds(const Vec3<T>& lo, const Vec3<T>& hi, const Vec3<float>& p, T blur) {
-    const float below = 1.0f - 0x1p-20f, tiny = 1e-36f, largest = 3.4028234663852886e38f;
+    const float below = 1.0f - 1.0f / (1 << 20), tiny = 1e-36f, largest = __FLT_MAX__;
     T out = {};
     for (int axis = 0; axis < 3; ++axis) {
         const T ahead = lo[axis] - p[axis], behind = p[axis] - hi[axis];
@@ -39,7 +39,7 @@ template <int N> WRT_INLINE int near_triangles(const float* numbers, const Vec3<
         const T size = -lo[axis] > hi[axis] ? -lo[axis] : hi[axis];
         largest = size > largest ? size : largest;
     }
-    const T pad = blur + 0x1p-19f * largest + 1e-30f;  // more than units/box.py adds: box_pad, padded_lo and padded_hi
+    const T pad = blur + 1.0f / (1 << 19) * largest + 1e-30f;  // more than units/box.py adds: box_pad, padded_lo and padded_hi
     return mask_of((squared_bounds(lo, hi, p, pad) <= reach) | (a[0] != a[0]));
 }
 

@@ -79,14 +79,24 @@ def _has_stack() -> bool:
 
 
 class Pool(ThreadPoolExecutor):
-    """Pool of threads with large stacks, which start when they are needed and stay."""
+    """Pool of threads with large stacks, which start when they are needed and stay.
+
+    The standard pool refuses tasks after the end of Python's main thread. This pool then runs a task in the thread that submits it.
+    """
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
         super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
 
     def submit(self, task: Callable[P, T], /, *arguments: P.args, **named: P.kwargs) -> Future[T]:
-        with _large_stacks():
-            return super().submit(task, *arguments, **named)
+        if threading.main_thread().is_alive():
+            with _large_stacks():
+                return super().submit(task, *arguments, **named)
+        future = Future[T]()
+        try:
+            future.set_result(task(*arguments, **named))
+        except BaseException as error:
+            future.set_exception(error)
+        return future
 
 
 @cache
@@ -195,7 +205,10 @@ class FreeList(Generic[T]):
 
     def run(self, task: Callable[[T], R]) -> R:
         """Run a task, which may launch kernels, with a free thing."""
-        thing = self.take()
-        result = task(thing) if _has_stack() else submit(task, thing).result()
-        self.give(thing)
-        return result
+        def run() -> R:
+            thing = self.take()
+            result = task(thing)
+            self.give(thing)
+            return result
+
+        return with_stack(run)

@@ -40,7 +40,7 @@ def test_meshes_without_area_are_refused(tmp_path: Path, text: str, says: str) -
 def test_paths_that_are_no_mesh_file(tmp_path: Path) -> None:
     (tmp_path / "folder.ply").mkdir()
     write(tmp_path, "x", "a.fbx")
-    for name, says in (("none.obj", "no such file"), ("folder.ply", "Is a directory"), ("a.fbx", ".npz, .obj, .off, .ply, .stl")):
+    for name, says in (("none.obj", "no such file"), ("folder.ply", "no regular file"), ("a.fbx", ".npz, .obj, .off, .ply, .stl")):
         with refused(None, says, path=name):
             load_mesh(tmp_path / name)
 
