@@ -96,7 +96,7 @@ def read_arrays(path: PathLike) -> dict[str, np.ndarray]:
             file.readinto(data.data)
             if zlib.crc32(data.data) != info.CRC:
                 raise ValueError(f"the checksum of {info.filename} does not match")
-            magic, size = NPY.unpack_from(data)
+            magic, size = NPY.unpack_from(data.data)
             head = HEADER.fullmatch(data[NPY.size : NPY.size + size].tobytes().decode("latin-1"))
             if magic != MAGIC or head is None:
                 raise ValueError(f"{info.filename} is no array of numbers or text, by rows, in version 1.0 of the format")

@@ -137,7 +137,7 @@ class RaycastingScene:
         accel, (shape, rows) = scene.accel, _rows(rays, "rays", 6, scene.origin)
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
             return _answer(trace_made(accel.snapshot, _split(rows), True, threads)[0], shape)
-        origins, directions, t_min, t_max = _split(rows).rays(threads)
+        origins, directions, t_min, t_max = map(np.asarray, _split(rows).rays(threads))
         near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
         end = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
         hit = accel.any_hit(origins, directions, np.fmax(near, np.float32(0.0)), np.minimum(t_max, end), threads)

@@ -153,6 +153,10 @@ class HostLists:
         self.copy(first[:-1], packed)
         return out if out is not self.out else [array[:total].copy() for array in out]
 
+    def release(self) -> None:
+        """Give the second lists' memory back."""
+        self.kept = ()
+
 
 @made_once
 def host_lists(structure: Structure) -> FreeList[HostLists]:
@@ -164,7 +168,7 @@ class GpuLists:
     """Lists of a batch of rays on a GPU, in new arrays. Methods as those of HostLists."""
 
     def __init__(self, device: Device) -> None:
-        self.device, self.kept = device, ()
+        self.device = device
 
     def find(self, snapshot: Snapshot, rays: Sequence[WarpArray], roots: np.ndarray | None, limit: int, mesh: Mesh,
              counting: bool) -> np.ndarray:
@@ -207,6 +211,9 @@ class GpuLists:
         out = [wp.empty(rows_of(first[-1]), dtype=kind, device=self.device) for kind in HIT_KINDS]
         self.copy(first[:-1], hit_arrays(out))
         return out
+
+    def release(self) -> None:
+        self.lists = []
 
 
 def hit_arrays(arrays: Sequence[WarpArray]) -> WarpStruct:
