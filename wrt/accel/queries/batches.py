@@ -63,11 +63,10 @@ class MadeRays(NamedTuple):
     check: Callable[[np.ndarray], None] | None = None
 
     def rays(self, threads: int) -> Rays:
-        n = len(self.given[0])
-        origins, directions, t_max = self.kernel.rows(n, self.given, *self.inputs, threads=threads)
+        origins, directions, t_max = self.kernel.rows(len(self.given[0]), self.given, *self.inputs, threads=threads)
         if self.check:
             self.check(t_max)
-        return Rays(origins, directions, constant(0.0, n), t_max)
+        return Rays(origins, directions, constant(0.0, len(t_max)), t_max)
 
 
 def trace_made(snapshot: Snapshot, made: MadeRays, any_hit: bool, threads: int) -> list[np.ndarray]:
@@ -241,7 +240,7 @@ class Worker:
         return refused
 
     def trace_made(self, snapshot: Snapshot, made: MadeRays, n: int) -> list[np.ndarray]:
-        """Trace n rays, at most SMALL, and return the results."""
+        """Trace n rays, at most SMALL, and return the results. Raises InputError for invalid rays, as trace_query."""
         origins, directions, t_min, t_max, *_ = self.rays
         maker = self.makers.get(made.kernel)
         if maker is None:
@@ -250,7 +249,8 @@ class Worker:
         if made.check:
             made.check(t_max[:n])
         t_min[:n] = 0.0
-        self.launch(snapshot, self.packed, 0, n)
+        if self.launch(snapshot, self.packed, 0, n):
+            made.rays(1).checked()
         return [found[:n].copy() for found in self.results]
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> bool:

@@ -358,7 +358,7 @@ def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray | None, v: np.ndarray 
 
 LIBRARIES: Registry[type[Contestant]] = Registry("contestant", {
     kind.NAME: kind for kind in (Embree, WarpMesh, Open3D, Trimesh, MitsubaRays)}, "wrt.contestants", type)
-RIVALS = ("embree", "embree:mode=fast", "open3d", "trimesh", "warp")  # those that a comparison of speed has by default
+RIVALS = ("embree", "embree:mode=fast", "open3d", "trimesh", "warp")  # the default rivals in a comparison of speed
 
 
 def contestant(name: str, device: str = DEFAULT_DEVICE) -> Contestant:
