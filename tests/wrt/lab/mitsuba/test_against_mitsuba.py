@@ -72,7 +72,10 @@ def test_normals_agree_at_every_pixel_but_edges(name: str) -> None:
     same = hit & (ours["prim_id"] == theirs.prim_id)
     assert difference[same].max() < 1e-3  # slivers: their flat normal is ill-conditioned in float32
     assert np.percentile(difference[same], 99) < 2e-6
-    assert (ours["prim_id"] != theirs.prim_id).mean() < 2e-3  # rays through an edge, where either triangle is right
+    # Where two triangles lie on one another, Mitsuba takes either, by the processor's instruction set; so does it at an edge.
+    one_plane = hit & (difference < 1e-6) & np.isclose(ours["depth"], theirs.depth, rtol=3e-7, atol=0.0)
+    assert ((ours["prim_id"] != theirs.prim_id) & ~one_plane).mean() < 2e-3
+    assert (ours["prim_id"] <= theirs.prim_id)[one_plane].mean() > 0.99  # wrt takes the lowest index, but for the rounding of t
 
 
 def placed(mesh: wrt.Mesh, material: Material, *, at: tuple[float, ...], scale: float = 1.0, turn: float = 0.0) -> Object:
