@@ -38,12 +38,11 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
 
     The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
     The viewer needs websockets: pip install "wrt[viewer]"."""
-    from wrt.viewer.page import Page, Tools
+    from wrt.viewer.page import Page
     from wrt.viewer.server import import_websockets, listen
 
     import_websockets()
     listen(place).close()  # raises InputError before the scene is read
-    from wrt.lab.costs import CostCounter
     from wrt.lab.walk.walk import walk
     from wrt.renderer.options import Options
 
@@ -52,7 +51,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     loaded = load(scene, quiet, staging).with_settings(**settings)
     with naming(scene):
         loaded.camera(options["camera"])  # raises InputError with the file's name
-    page = Page(loaded, rendering, place, spp, tools=Tools(CostCounter.beside, walk), warn=(lambda text: None) if quiet else say)
+    page = Page(loaded, rendering, place, spp, walk_of=walk, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
         say("Ctrl-C ends the viewer")

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
@@ -18,29 +18,19 @@ from wrt.kernels.traverse.observer import Counts, Recorder
 from wrt.kernels.warp_private import fields_of
 from wrt.renderer.film import DeviceFilm, Rectangle, Work
 from wrt.renderer.plan import Plan
-from wrt.renderer.prepare import Prepared, prepare
-from wrt.scene.cameras import CameraKind
+from wrt.renderer.prepare import prepare
 
 T = TypeVar("T")
 COUNTERS = tuple(fields_of(Counts))
 
 
 class CostCounter:
-    """A render that counts traversal steps. built: the scene prepared for pictures, whose structure and arrays the counter shares."""
+    """A render that counts traversal steps."""
 
-    def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
+    def __init__(self, plan: Plan, device: Device) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(observer="sum"))
         features = replace(plan.features, counting=True)
-        self.prepared = prepare(replace(plan, structure=WrappedStructure(counting, ray_log), features=features), device, built)
-
-    @classmethod
-    def beside(cls, built: Prepared) -> "CostCounter":
-        """Return a counter that shares the structure and arrays of `built`, a scene prepared for pictures."""
-        return cls(built.plan, built.device, built)
-
-    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """Change camera and settings; arguments as for Prepared.aimed."""
-        self.prepared = self.prepared.aimed(camera, angles_of, **settings)
+        self.prepared = prepare(replace(plan, structure=WrappedStructure(counting, ray_log), features=features), device)
 
     def film(self) -> DeviceFilm:
         plan = self.prepared.plan
@@ -68,26 +58,3 @@ class CostCounter:
         recorder.counts, log.used = self.zeros(n, Counts), self.zeros(n, wp.int32)
         self.trace(rectangle, film, recorder, log)
         return log.used.numpy(), on_host(recorder.counts)
-
-    def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
-        """Return a map (H, W) int32 for each of COUNTERS: the sum over a pixel's rays (for `stack` the largest value).
-        After each tile, a thread calls `go_on` with the number of finished pixels. If it returns False, stop and return None."""
-        film = self.film()
-        x0, y0, x1, y1 = self.prepared.plan.crop
-        out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}
-        done: list[int] = []
-        stopped: list[bool] = []
-
-        def work(rectangle: Rectangle) -> None:
-            if stopped:
-                return
-            x, y, width, height = rectangle
-            _, counts = self.totals(rectangle, film)
-            for name, values in out.items():
-                values[y - y0 : y - y0 + height, x - x0 : x - x0 + width] = counts[name].reshape(height, width)
-            done.append(width * height)
-            if not go_on(sum(done)):
-                stopped.append(True)
-
-        self.each(work, self.prepared.tiles(1))
-        return None if stopped else out

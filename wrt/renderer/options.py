@@ -7,26 +7,27 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from wrt.accel.scenes.instancing import INSTANCING
 from wrt.accel.snapshot import check_units
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, did_you_mean, shown
+from wrt.core.checks import as_choice, as_integer, as_names, as_one, as_path, as_tuple, require_known, shown, unknown
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.threads import thread_count
 from wrt.picture.film import Film
 from wrt.scene.cameras import CameraKind
-from wrt.scene.settings import SettingChanges
+from wrt.scene.settings import SETTINGS, SettingChanges
 
 if TYPE_CHECKING:
     from distributed import Client
 
 AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
+WHOLE = {"seed": (0, 2**32 - 1), "tile_size": (1, 1 << 15), "pass_size": (1, 1 << 24)}  # options with their lowest and highest value
 
 
 @dataclass(frozen=True)
@@ -106,25 +107,18 @@ class Options:
         check_units(self.triangle, self.box)
         as_choice(self.instancing, INSTANCING, "instancing")
         self.aov = as_names(self.aov, "aov")
-        no_aov = sorted(set(self.aov) - set(AOVS))
-        if no_aov:
-            raise InputError(f"no AOV {', '.join(no_aov)}",
-                             argument="aov", hint=f"{did_you_mean(no_aov[0], AOVS)}there is {', '.join(AOVS)}")
-        for name in ("time_limit", "target_error"):
-            as_one(getattr(self, name), (int, float, np.number, type(None)), name)
-        if self.time_limit is not None and not self.time_limit > 0.0:
-            raise InputError(f"must be more than 0 seconds, got {self.time_limit}", argument="time_limit")
-        if self.target_error is not None and not 0.0 < self.target_error < math.inf:
-            raise InputError(f"must be more than 0 and finite, got {self.target_error}", argument="target_error")
-        as_one(self.checkpoint_every, (int, float, np.number), "checkpoint_every")
-        if not self.checkpoint_every > 0.0:
-            raise InputError(f"must be more than 0 seconds, got {self.checkpoint_every}", argument="checkpoint_every")
+        for name in self.aov:
+            require_known(name, AOVS, "AOV", "aov")
+        for name in ("time_limit", "target_error", "checkpoint_every"):
+            value = as_one(getattr(self, name), (int, float, np.number, type(None)), name)
+            if value is not None and not 0.0 < float(value) < math.inf:
+                raise InputError(f"must be more than 0 and finite, got {value}", argument=name)
+        for name, (low, high) in WHOLE.items():
+            if getattr(self, name) is not None:
+                setattr(self, name, as_integer(getattr(self, name), name, low, high))
         self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
         if as_one(self.resume, bool, "resume") and self.checkpoint is None:
             raise InputError("needs a checkpoint", argument="resume", hint="name its file with `checkpoint`")
-        self.tile_size = None if self.tile_size is None else as_integer(self.tile_size, "tile_size", 1, 1 << 15)
-        self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
-        self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
         if self.crop is not None:
             self.crop = tuple(map(int, as_tuple(self.crop, (int, np.integer), "crop")))  # type: ignore[arg-type, assignment]
             if len(self.crop or ()) != 4:
@@ -135,59 +129,64 @@ class Options:
         as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)
+        self._check_devices()
+
+    def _check_devices(self) -> None:
+        if self.devices is not None and self.executor is not None:
+            raise InputError("and executor exclude each other", argument="devices", hint="each worker of an executor uses `device`")
         if self.devices is not None:
-            self._check_devices()
+            self.devices = as_tuple(self.devices, str, "devices")
+            kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
+            if len(kinds) != 1:
+                raise InputError(f"must be one or more devices of one kind, since others round differently, got {shown(self.devices)}",
+                                 argument="devices")
+            self.device = self.devices[0]
         elif self.executor is None:
             start(self.device)
         elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # an attribute of Dask's Client
             raise InputError("must be a concurrent.futures.Executor or a dask.distributed.Client,"
                              f" got {shown(self.executor)}", argument="executor")
 
-    def _check_devices(self) -> None:
-        self.devices = as_tuple(self.devices, str, "devices")
-        if self.executor is not None:
-            raise InputError("and executor exclude each other", argument="devices", hint="each worker of an executor uses `device`")
-        kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
-        if len(kinds) != 1:
-            raise InputError(f"must be one or more devices of one kind, since others round differently, got {shown(self.devices)}",
-                             argument="devices")
-        self.device = self.devices[0]
-
 
 OPTIONS = tuple(each.name for each in fields(Options))
 
 
-class PixelOptions(SettingChanges, total=False):
-    """The keywords of `inspect`: the scene's settings, and those fields of Options that decide on a pixel or on its computation."""
+class RenderOptions(SettingChanges, total=False):
+    """The keywords of `render`: the scene's settings, and the fields of Options. `inspect` and `profile` take some of them."""
 
     seed: int
     device: str
     accel: str
     threads: int | None
     camera: str | int | CameraKind | None
+    crop: tuple[int, int, int, int] | None
+    aov: str | Sequence[str]
+    time_limit: float | None
+    target_error: float | None
+    tile_size: int | None
+    pass_size: int | None
+    progress: Callable[[Progress], None] | None
     triangle: str
     box: str
     instancing: str
     accel_options: dict[str, object]
-
-
-class ProfileOptions(PixelOptions, total=False):
-    """The keywords of `profile`."""
-
-    crop: tuple[int, int, int, int] | None
-    tile_size: int | None
-    progress: Callable[[Progress], None] | None
-
-
-class RenderOptions(ProfileOptions, total=False):
-    """The keywords of `render`: the scene's settings, and the fields of Options."""
-
-    aov: str | Sequence[str]
-    time_limit: float | None
-    target_error: float | None
-    pass_size: int | None
     checkpoint: str | os.PathLike[str] | None
     checkpoint_every: float
     resume: bool
     devices: Sequence[str] | None
     executor: Executor | Client | None
+
+
+# The options that decide on a pixel or on its computation, which `inspect` takes, and those of `profile`.
+OF_A_PIXEL = ("seed", "device", "threads", "accel", "accel_options", "triangle", "box", "instancing", "camera")
+OF_A_PROFILE = (*OF_A_PIXEL, "crop", "tile_size", "progress")
+
+
+def split(keywords: RenderOptions, function: str, taken: tuple[str, ...] = OPTIONS) -> tuple[SettingChanges, dict[str, Any]]:
+    """Return the settings and the options among the keywords of `function`. Raises InputError for an option that is not in `taken`."""
+    for name in keywords:
+        if name not in (*SETTINGS, *taken):
+            raise unknown(name, f"argument of {function}", (*SETTINGS, *taken), argument=name)
+    settings = {name: value for name, value in keywords.items() if name in SETTINGS}
+    options = {name: value for name, value in keywords.items() if name not in settings}
+    return cast(SettingChanges, settings), options

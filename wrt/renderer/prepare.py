@@ -121,17 +121,14 @@ def kind_of(device: Device) -> str:
     return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
 
 
-def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepared:
-    """Compile kernels, upload arrays, and build the structure. Raises InputError if the scene cannot be rendered.
-
-    built: prepared scene whose arrays and structure are reused, so that only kernels are compiled."""
+def prepare(plan: Plan, device: Device) -> Prepared:
+    """Compile kernels, upload arrays, and build the structure. Raises InputError if the scene cannot be rendered."""
     work = _Preparation(plan, device)
-    work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
-    arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
-    lights = arrays.lighting.count + plan.features.extra_lights
+    work.run()
+    lights = work.arrays.lighting.count + plan.features.extra_lights
     waves = Waves(plan.wave_kernels, lights, FreeList(partial(Buffers, plan.features, lights))) if plan.by_waves else None
     camera = camera_struct(plan.camera, plan.scene.settings.size)
-    return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera, waves, work.seconds)
+    return Prepared(plan, device, work.threads, work.kernels, work.arrays, work.accel, camera, waves, work.seconds)
 
 
 class _Preparation:
@@ -146,23 +143,22 @@ class _Preparation:
         self.begin, self.seconds = time.perf_counter(), {"compile": 0.0}
         self.fraction_built, self.reported = 0.0, ("", 0)
 
-    def run(self, jobs: list[Callable[[], None]]) -> None:
-        """Run the jobs. After Ctrl-C or an error, return without waiting for the compiler. Python handles Ctrl-C between short waits."""
-        with nullcontext() if self.plan.options.progress is None else WATCH.reported_by_caller():
-            self._run(jobs)
-
-    def _run(self, jobs: list[Callable[[], None]]) -> None:
+    def run(self) -> None:
+        """Build and compile. Ctrl-C, which Python handles between short waits, and an error end it without waiting for the compiler."""
+        progress = self.plan.options.progress
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
+        jobs: list[Callable[[], None]] = [self.build, *(partial(self.compile, kernel) for kernel in self.kernels)]
         pending = {pool.submit(job) for job in jobs}
-        try:
-            while pending:
-                finished, pending = wait(pending, timeout=0.1, return_when=FIRST_EXCEPTION)
-                for job in finished:
-                    job.result()
-                if pending and self.plan.options.progress is not None:
-                    self._report(self.plan.options.progress, time.perf_counter() - self.begin)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        with nullcontext() if progress is None else WATCH.reported_by_caller():
+            try:
+                while pending:
+                    finished, pending = wait(pending, timeout=0.1, return_when=FIRST_EXCEPTION)
+                    for job in finished:
+                        job.result()
+                    if pending and progress is not None:
+                        self._report(progress, time.perf_counter() - self.begin)
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
 
     def _report(self, progress: Callable[[Progress], None], seconds: float) -> None:
         """Call `progress` if the stage or its percentage has changed, and the stage takes long."""

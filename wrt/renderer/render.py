@@ -16,12 +16,11 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build
 from wrt.accel.scenes.instancing import stored_meshes
 from wrt.accel.structures import default_options
-from wrt.core.checks import unknown
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning, warn
 from wrt.io.load import as_scene
 from wrt.picture.film import Film
-from wrt.renderer.options import OPTIONS, Options, RenderOptions
+from wrt.renderer.options import Options, RenderOptions, split
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import kind_of, prepare
 from wrt.renderer.schedule import LocalTracer, Run
@@ -30,7 +29,7 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.defaults import is_lit
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
-from wrt.scene.settings import SETTINGS, SettingChanges
+from wrt.scene.settings import SettingChanges
 
 if TYPE_CHECKING:
     from wrt.renderer.checkpoint import Checkpoint
@@ -119,13 +118,10 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     >>> film = wrt.render("scenes/whitted.toml", spp=16, size=(320, 180), aov=["depth"])
     >>> film.save("whitted.png")
     """
-    keywords: dict[str, Any] = {**options}
-    changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
-    if keywords.get("target_error") is not None and changes.get("spp") is None:
+    changes, others = split(options, "render")
+    resolved = Options(**others)
+    if resolved.target_error is not None and changes.get("spp") is None:
         changes["spp"] = MAX_SPP
-    for name in [each for each in keywords if each not in OPTIONS]:
-        raise unknown(name, "argument of render", (*SETTINGS, *OPTIONS), argument=name)
-    resolved = Options(**keywords)
     scene = as_scene(scene).with_settings(**changes)
     if resolved.executor is None and resolved.devices is None:
         film = Renderer(scene, resolved, once=True).run()

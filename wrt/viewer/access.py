@@ -1,7 +1,7 @@
 """Access to the viewer: every request must carry the token, and a Host and an Origin of this viewer.
 
-The printed address contains the token. It redirects to the page's path `/TOKEN/`, from which the page derives the address of its
-WebSocket. The token is no cookie, because a browser sends cookies to every port of a host, also to another user's server.
+The printed address has the path `/TOKEN/`, from which the page derives the address of its WebSocket. The token is no cookie, because a
+browser sends cookies to every port of a host, also to another user's server.
 """
 
 import hmac
@@ -10,7 +10,6 @@ import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address
-from urllib.parse import parse_qsl, urlencode
 
 from wrt.core.errors import InputError
 
@@ -45,25 +44,15 @@ class Access:
         if origins and (len(origins) != 1 or origins[0] not in own):
             raise Refused("origin", f"a request by a page of the origin {shown(origins)}; --allow-origin can allow it")
 
-    def strip_token(self, target: str) -> tuple[str, str]:
-        """Return the path of a request without the token, and the address to redirect to ("": do not redirect).
+    def strip_token(self, target: str) -> str:
+        """Return the path of a request without the token and the query. Raises Refused unless the path begins with the token.
 
-        target: path and query of the request. The address is relative, because a proxy may serve the viewer under a sub-path.
-        Raises Refused unless the path begins with the token, or the query has `token=` with it."""
-        path, _, query = target.partition("?")
-        first, slash, rest = path[1:].partition("/")
-        pairs = parse_qsl(query, keep_blank_values=True)
-        others = urlencode([pair for pair in pairs if pair[0] != "token"], errors="replace")
-        page = f"{self.token}/" + (f"?{others}" if others else "")
-        if path.startswith("/") and self._is_token(first):
-            return "/" + rest, "" if slash else page
-        tokens = [value for name, value in pairs if name == "token"]
-        if path.startswith("/") and len(tokens) == 1 and self._is_token(tokens[0]):
-            return path, page if path == "/" else ""
-        raise Refused("token", "a request without the token of the printed address")
-
-    def _is_token(self, text: str) -> bool:
-        return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
+        target: path and query of the request."""
+        token, slash, rest = target.partition("?")[0][1:].partition("/")
+        known = hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
+        if not (target.startswith("/") and slash and known):
+            raise Refused("token", "a request without the token of the printed address")
+        return "/" + rest
 
 
 @dataclass(frozen=True)
@@ -91,7 +80,7 @@ def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
     elif ip.is_loopback:
         names |= set(LOOPBACK)
     access = Access(frozenset(origin_of("http", name, port) for name in names) | frozenset(place.allow_origins), port)
-    return access, f"{origin_of('http', home, port)}/?token={access.token}"
+    return access, f"{origin_of('http', home, port)}/{access.token}/"
 
 
 def as_host(address: str) -> str:

@@ -1,5 +1,6 @@
 """The camera that a user steers: orbits, pans, dollies and walks, and its table of a TOML scene file."""
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,6 @@ PARALLEL = 0.999  # Largest |cosine| between the view direction and +y for which
 NO_FOCUS = Camera().focus_distance  # Focus distance of a camera whose scene sets no focus.
 LEVEL = 1e-6  # Largest |y| of the x axis of an upright camera.
 STEEPEST = math.radians(89.0)  # Largest angle of the view above or below the horizon.
-PRECISION = 1e-5  # Largest error of a camera's TOML table, relative to the distance of its target.
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
     It is the point in focus. If the camera has no focus, it is the point nearest to the middle of the scene. If that middle is behind
     the camera, it is the point at the default focus distance."""
     origin, forward = camera.camera_to_world[:3, 3], -camera.camera_to_world[:3, 2]
-    distance = _focus(camera)
+    distance = camera.focus_distance if isinstance(camera, Camera) else NO_FOCUS
     if distance == NO_FOCUS and (scene.objects or scene.spheres):
         middle, radius = bounding_sphere(scene)
         along = float((middle - origin) @ forward)
@@ -142,24 +142,9 @@ class Steering:
 # --- scene files ------------------------------------------------------------------------------------------------------
 
 
-def _focus(camera: CameraKind) -> float:
-    return camera.focus_distance if isinstance(camera, Camera) else NO_FOCUS
-
-
 def camera_toml(pose: Pose, name: str = "view") -> str:
-    """Return the camera as a table of a TOML scene file. Its numbers are rounded: directions change by about PRECISION at most."""
-    camera = pose.camera
-    matrix = camera.camera_to_world
-    reach = max(_focus(camera) if _focus(camera) != NO_FOCUS else pose.distance, 1e-3 * float(np.abs(matrix[:3, 3]).max()))
-    decimals = math.ceil(-math.log10(PRECISION * reach))
-    ends = {"position": matrix[:3, 3], "target": matrix[:3, 3] - reach * matrix[:3, 2]}
-    values: dict[str, Any] = {key: np.round(end, decimals) for key, end in ends.items()}
-    values |= {"up": np.round(matrix[:3, 1], 6), **camera.as_in_files()}
-    lines = [f"[cameras.{name}]", f'type = "{camera.kind}"', *(f"{key} = {_number(value)}" for key, value in values.items())]
+    """Return the camera as a table of a TOML scene file."""
+    camera, matrix = pose.camera, pose.camera.camera_to_world
+    values = {"type": camera.kind, "position": matrix[:3, 3].tolist(), "target": pose.target.tolist(), "up": matrix[:3, 1].tolist()}
+    lines = [f"[cameras.{name}]", *(f"{key} = {json.dumps(value)}" for key, value in (values | camera.as_in_files()).items())]
     return "\n".join(lines) + "\n"
-
-
-def _number(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return f"[{', '.join(repr(float(each) + 0.0) for each in value)}]"  # + 0.0 turns -0.0 into 0.0
-    return repr(value if isinstance(value, int) else float(f"{value:.7g}") + 0.0)

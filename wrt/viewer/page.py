@@ -10,13 +10,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.types import JsonObject
-from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
 from wrt.renderer.progress import time_left
@@ -26,42 +25,31 @@ from wrt.viewer.access import HERE, Place, Refused, access_for
 from wrt.viewer.camera import Steering, camera_toml
 from wrt.viewer.panel import controls_of
 from wrt.viewer.rays import Rays, WalkOf, Walks, pick
-from wrt.viewer.refine import CounterOf, Shown, Viewer
+from wrt.viewer.refine import Shown, Viewer
 from wrt.viewer.server import Browser, Server, listen, to_stderr
 
 MOST_PIXELS = 1 << 23  # Largest number of pixels of a picture; a larger window shows the picture enlarged.
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture.
 WIDEST = math.radians(160.0)  # Horizontal angle of view that a narrow window may widen a camera to.
-LEGEND_HEIGHT = 12  # Pixels.
 DARK_SHARE = 0.01  # Share of visibly too dark pixels above which the page warns.
 FOLDER = Path(__file__).parent / "page"
 FILES = {"/": ("page.html", "text/html; charset=utf-8"), "/page.css": ("page.css", "text/css; charset=utf-8"),
          "/page.js": ("page.js", "text/javascript; charset=utf-8")}
 
 
-class Tools(NamedTuple):
-    """Functions of the laboratory for a page. counter_of: see Viewer. walk_of: see wrt.viewer.rays; None: no walks."""
-
-    counter_of: CounterOf | None = None
-    walk_of: WalkOf | None = None
-
-
-NO_TOOLS = Tools()
-
-
 class Page:
     """A server with the page and one Viewer. Both run until `close`. `url` is the page's address with the token.
 
-    spp: see Viewer. warn: called with one line, once for each kind of refused request or message. Raises InputError if the server cannot
-    listen at `place`."""
+    spp: see Viewer. walk_of: see Walks. warn: called with one line, once for each kind of refused request or message. Raises InputError
+    if the server cannot listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
-                 tools: Tools = NO_TOOLS, warn: Callable[[str], None] = to_stderr) -> None:
+                 walk_of: WalkOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
         self.scene = scene
-        self.viewer = Viewer(scene, options, self._show, self._report, spp, tools.counter_of)
+        self.viewer = Viewer(scene, options, self._show, self._report, spp)
         self.steering = Steering(scene, self.viewer.view.camera)
         self.controls = controls_of(self.viewer, self.steering)
-        self.rays, self.walks = Rays(self.viewer.renderers, self._report), Walks(tools.walk_of)
+        self.rays, self.walks = Rays(self.viewer.renderers, self._report), Walks(walk_of)
         self._size = self.viewer.view.size  # of the window that was opened or resized last, in device pixels
         self._asked: dict[str, JsonObject] = {}  # the newest message "click" and the newest message "walk" that wait for an answer
         self._asking = threading.Condition()
@@ -203,8 +191,6 @@ class Page:
         self.viewer.again()
 
     def file(self, path: str) -> tuple[str, bytes] | None:
-        if path == "/legend.png":
-            return "image/png", encode_png(np.repeat(colors()[None], LEGEND_HEIGHT, axis=0))
         name, kind = FILES.get(path, ("", ""))
         return (kind, (FOLDER / name).read_bytes()) if name else None
 
@@ -215,15 +201,13 @@ def status(shown: Shown, viewer: Viewer) -> JsonObject:
     target, total = viewer.renderers.options.target_error, viewer.spp
     noise = f", noise {shown.error:.2g}" if math.isfinite(shown.error) else ""
     noise += f" (target {target:g})" if noise and target is not None else ""
-    lines = [f"{shown.view.cost} per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}" if shown.view.cost
-             else f"{shown.spp:,} of {total:,} samples per pixel{noise}",
+    lines = [f"{shown.spp:,} of {total:,} samples per pixel{noise}",
              f"{width} x {height} pixels" + (", coarse" if shown.scale > 1 else ""),
              f"{shown.speed / 1e6:.2f} million rays per second, {shown.rays_per_sample:.1f} rays per sample"]
     if shown.visibly_cut > DARK_SHARE:
         lines.append(f"{100.0 * shown.visibly_cut:.2g} % of the pixels are visibly too dark: raise bounces")
-    left = "done" if shown.done else time_left(shown.seconds_left) if shown.scale == 1 and not shown.view.cost else "coarse"
-    return {"lines": lines, "left": left, "done": 1.0 if shown.done else shown.spp / total if shown.scale == 1 else 0.0,
-            "legend": f"0 (dark) to {short(shown.top)} (light)" if shown.view.cost else ""}
+    left = "done" if shown.done else time_left(shown.seconds_left) if shown.scale == 1 else "coarse"
+    return {"lines": lines, "left": left, "done": 1.0 if shown.done else shown.spp / total if shown.scale == 1 else 0.0}
 
 
 def widened(camera: CameraKind, size: tuple[int, int]) -> CameraKind:

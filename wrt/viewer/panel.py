@@ -27,7 +27,6 @@ from wrt.viewer.refine import Viewer
 LARGEST_SIDE = 16384  # pixels of the picture's area
 LONGEST_MOVE = 100.0  # largest absolute value of a number in a move
 LAST_SAMPLE = LAST_STEP = (1 << 24) - 1
-PICTURE = "picture"
 
 
 def is_number(value: object, low: float, high: float) -> TypeGuard[float]:
@@ -112,8 +111,6 @@ def controls_of(viewer: Viewer, steering: Steering) -> dict[str, Control]:
                 "Bounces after the first hit; 0 is direct light alone", 0, viewer.deepest, 1, whole=True),
         Control("structure", lambda: viewer.view.accel, lambda value: viewer.change(accel=value),
                 "Acceleration structure: it changes the speed, not the picture", choices=tuple(ACCELERATORS)),
-        Control("show", lambda: viewer.view.cost or PICTURE, lambda value: viewer.change(cost="" if value == PICTURE else value),
-                "The picture, or a heat map of a counter, summed over the rays of each pixel", choices=(PICTURE, *viewer.costs)),
         Control("exposure", lambda: viewer.settings.exposure, lambda value: viewer.tone(exposure=float(value)),
                 "Stops; each doubles the displayed values", min(-8.0, stops), max(8.0, stops), 0.1),
         Control("tone mapping", lambda: viewer.settings.tonemap, lambda value: viewer.tone(tonemap=value),

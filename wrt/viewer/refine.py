@@ -8,16 +8,14 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import require_known
 from wrt.core.compiling import COMPILING
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
-from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import auto_exposure, to_codes
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
@@ -31,37 +29,23 @@ PATIENCE = 0.5  # Seconds after which the next change interrupts even the first 
 EVERY = 0.25  # Seconds between two pictures while a view is refined.
 SCALES = (1, 2, 4, 8, 16, 32)  # Pixels of the view, along each side, for one pixel of a coarse picture.
 DEEPEST = 12  # Largest max_depth that the user can choose, unless the scene's is larger.
-COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # Counters for heat maps.
 TILE_SIZE = 16  # Pixels a side; small, because the next view waits until all running tiles end.
 
-
-class Counter(Protocol):
-    """Counts the work of each pixel, such as visited nodes, for heat maps."""
-
-    def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """Set another camera and other settings, as Prepared.aimed does."""
-
-    def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return an array (H, W) int32 for each counter, by its name. Return None once go_on(number of counted pixels) returns False."""
-
-
-CounterOf = Callable[[Prepared], Counter]
 Kind: TypeAlias = tuple[str, str, tuple[tuple[str, bool], ...]]  # name of the structure, kind of camera and its switches
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture or heat map that the user requests."""
+    """A picture that the user requests."""
 
     camera: CameraKind
     size: tuple[int, int]  # width, height in pixels at full resolution
     max_depth: int
     accel: str  # a name in ACCELERATORS
-    cost: str = ""  # the counter of a heat map, one of COSTS; "": the picture
 
     def same(self, other: "View") -> bool:
         """Return True if both views have the same pixels."""
-        fields, others = ((v.size, v.max_depth, v.accel, v.cost, digest(v.camera)) for v in (self, other))
+        fields, others = ((v.size, v.max_depth, v.accel, digest(v.camera)) for v in (self, other))
         return fields == others
 
 
@@ -71,23 +55,18 @@ def kind_of(view: View) -> Kind:
 
 
 class Renderers:
-    """The renderers of a scene and their counters, by `kind_of` their views, made when a view first needs them.
+    """The renderers of a scene, by `kind_of` their views, made when a view first needs them. progress: callback of all renderers."""
 
-    progress: callback of all renderers. counter_of: makes the counter of a prepared scene; None: no heat maps."""
-
-    def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
-        self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
+    def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None]) -> None:
+        self.scene, self.options, self.progress = scene, options, progress
         self.by_kind: dict[Kind, Renderer] = {}
-        self.counters: dict[Kind, Counter] = {}
 
     def prepare(self, view: View) -> None:
-        """Make the renderer and the counter that the view needs, if they are missing. Raises InputError if that fails."""
+        """Make the renderer that the view needs, if it is missing. Raises InputError if that fails."""
         kind = kind_of(view)
         if kind not in self.by_kind:
             options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE, progress=self.progress)
             self.by_kind[kind] = Renderer(self.scene, options)
-        if view.cost and self.counter_of is not None and kind not in self.counters:
-            self.counters[kind] = self.counter_of(self.by_kind[kind].prepared)
 
     def prepared(self, view: View) -> Prepared | None:
         """Return the scene as prepared for the view; None before its structure is built."""
@@ -97,24 +76,14 @@ class Renderers:
     def picture(self, view: View, scale: int, spp: int) -> Film:
         """Render the view with one pixel for each block of `scale` x `scale` pixels."""
         renderer = self.by_kind[kind_of(view)]
-        renderer.aim(view.camera, view.size, **_settings(view, scale, spp))
+        width, height = (max(1, -(-side // scale)) for side in view.size)
+        renderer.aim(view.camera, view.size, size=(width, height), spp=spp, max_depth=view.max_depth)
         return renderer.run()
-
-    def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return Counter.costs of the view, with one pixel for each block of `scale` x `scale` pixels."""
-        counter = self.counters[kind_of(view)]
-        counter.aim(view.camera, view.size, **_settings(view, scale, 1))
-        return counter.costs(go_on)
-
-
-def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
-    width, height = (max(1, -(-side // scale)) for side in view.size)
-    return {"size": (width, height), "spp": spp, "max_depth": view.max_depth}
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture or heat map to show."""
+    """A picture to show."""
 
     codes: np.ndarray  # (h, w, 3) uint8, display values.
     view: View
@@ -126,10 +95,6 @@ class Shown:
     seconds_left: float = 0.0  # Until it is done, estimated.
     error: float = np.inf  # Estimated root mean square, over pixels and channels, of the standard error; inf: unknown.
     visibly_cut: float = 0.0  # As in Film.stats, of a finished picture.
-    # For a heat map, counts per pixel: the count shown in the last colour, the mean, and the largest count.
-    top: float = 0.0
-    mean: float = 0.0
-    largest: float = 0.0
 
 
 @dataclass(eq=False)
@@ -142,16 +107,16 @@ class _Work:
     last_shown: float = -np.inf  # time of the last picture shown
 
 
-class Pace(dict[tuple[str, bool], float]):
-    """Measured seconds per sample. Key: the structure's name, and False for a picture or True for a heat map."""
+class Pace(dict[str, float]):
+    """Measured seconds per sample, by the structure's name."""
 
     def note(self, view: View, samples: int, seconds: float) -> None:
         if samples:
-            self[view.accel, bool(view.cost)] = seconds / samples
+            self[view.accel] = seconds / samples
 
     def scales(self, view: View) -> list[int]:
         """Return the scales (see SCALES) to render, down to 1. The first scale should take COARSE seconds at most; unmeasured, it is 8."""
-        pace = self.get((view.accel, bool(view.cost)))
+        pace = self.get(view.accel)
         seconds = COARSE * 8**2 if pace is None else pace * view.size[0] * view.size[1]
         first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
         return [scale for scale in SCALES[::-1] if scale <= first]
@@ -163,22 +128,21 @@ class Viewer:
     Any thread may call the other methods, which never wait for a picture. `change` and `pause` increase the counter `_requested`. The
     viewer is watched from `change` until `pause`. Meanwhile `run` renders whenever `_requested` differs from `_completed`.
 
-    - scene, options: as for Renderer; options.camera has the first view. counter_of: as for Renderers.
+    - scene, options: as for Renderer; options.camera has the first view.
     - show: called with each picture. report: called with a text about compiling, building or an error; "" clears the last text.
     - spp: samples per pixel of the finished picture.
     """
 
     def __init__(self, scene: Scene, options: Options, show: Callable[[Shown], None],
-                 report: Callable[[str], None] = lambda text: None, spp: int = 1024, counter_of: CounterOf | None = None) -> None:
+                 report: Callable[[str], None] = lambda text: None, spp: int = 1024) -> None:
         self.scene, self.show, self.report, self.spp = scene, show, report, spp
-        self.costs = () if counter_of is None else COSTS
         self.settings = scene.settings  # exposure, tonemap and auto_exposure are those of the pictures
         camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(self.settings.max_depth, DEEPEST)
         self.view = View(camera, self.settings.size, self.settings.max_depth, options.accel)
         self.shown: Shown | None = None  # the last picture
-        self.film: Film | None = None  # of `shown`, unless that is a heat map
-        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
+        self.film: Film | None = None  # of `shown`
+        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress)
         self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
         self._pace = Pace()
         self._condition = threading.Condition()
@@ -191,11 +155,9 @@ class Viewer:
     def change(self, **changes: Any) -> bool:
         """Request the view with some fields of View changed.
 
-        Returns False if the view is watched and has the same pixels. Raises InputError for an unknown structure or counter."""
+        Returns False if the view is watched and has the same pixels. Raises InputError for an unknown structure."""
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"], "accel")
-        if changes.get("cost"):
-            require_known(changes["cost"], self.costs, "counter", "cost")
         with self._condition:
             view = replace(self.view, **changes)
             if view.same(self.view) and self._watched:
@@ -254,9 +216,8 @@ class Viewer:
         if work is not None:
             self._refine(work)
             self._completed = work.request
-        elif self.shown is not None and redraw:
-            codes = self.shown.codes if self.film is None else self._codes(self.film, self.shown.scale)
-            self._put(replace(self.shown, codes=codes), self.film)
+        elif self.shown is not None and self.film is not None and redraw:
+            self._put(replace(self.shown, codes=self._codes(self.film, self.shown.scale)), self.film)
 
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._requested != work.request:
@@ -266,7 +227,7 @@ class Viewer:
         try:
             for scale in self._pace.scales(work.view):
                 work.scale = scale
-                if not (self._count(work) if work.view.cost else self._trace(work)):
+                if not self._trace(work):
                     return
         except InputError as error:
             self.report(f"error: {error}")
@@ -323,26 +284,6 @@ class Viewer:
         automatic = self._automatic or 0.0 if settings.auto_exposure else 0.0
         return to_codes(film.pixels, settings.exposure + automatic, settings.tonemap)
 
-    def _put(self, shown: Shown, film: Film | None) -> None:
+    def _put(self, shown: Shown, film: Film) -> None:
         self.shown, self.film = shown, film
         self.show(shown)
-
-    def _count(self, work: _Work) -> bool:
-        """Render and show the heat map at work.scale; return False if it was abandoned."""
-        begin = time.perf_counter()
-
-        def go_on(done: int) -> bool:
-            seconds = time.perf_counter() - begin
-            self._pace.note(work.view, done, seconds)
-            return not self._abandoned(work, seconds)
-
-        costs = self.renderers.costs(work.view, work.scale, go_on)
-        if costs is None:
-            return False
-        values = costs[work.view.cost]
-        top = top_of(values)
-        speed = int(costs["probes"].sum(dtype=np.int64)) / (time.perf_counter() - begin)
-        self._put(Shown(colored(values, top), work.view, work.scale, 1, speed, float(costs["probes"].mean()), work.scale == 1,
-                        top=top, mean=float(values.mean()), largest=float(values.max())), None)
-        work.last_shown = time.perf_counter()
-        return True

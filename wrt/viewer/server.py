@@ -142,7 +142,7 @@ class Server:
         headers = request.headers
         try:
             self.access.check(headers.get_all("Host"), headers.get_all("Origin"), connection.local_address[0].partition("%")[0])
-            path, location = self.access.strip_token(request.path)
+            path = self.access.strip_token(request.path)
         except Refused as refused:
             self.report(refused.kind, f"refused {refused}")
             return _response(HTTPStatus.FORBIDDEN)
@@ -150,8 +150,6 @@ class Server:
             return _response(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET"})
         if [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]:
             return None
-        if location:
-            return _response(HTTPStatus.SEE_OTHER, {"Location": location})
         found = self.answers.file(path)
         if found is None:
             return _response(HTTPStatus.NOT_FOUND)

@@ -14,15 +14,10 @@ from urllib.parse import urlsplit
 PATIENCE = 300.0  # seconds; a busy machine may have to compile kernels
 
 
-def answer(port: int, target: str, headers: list[str], host: str = "127.0.0.1") -> bytes:
+def answer(port: int, target: str, headers: list[str]) -> bytes:
     """Send a GET and return the whole response (empty: the connection was closed). A WebSocket is closed as soon as it opens."""
-    request = "\r\n".join([f"GET {target} HTTP/1.1", *headers, "", ""])
-    return raw_answer(port, request.encode("latin-1", "surrogateescape"), host)
-
-
-def raw_answer(port: int, request: bytes, host: str = "127.0.0.1") -> bytes:
-    with socket.create_connection((host, port), timeout=PATIENCE) as connection:
-        connection.sendall(request)
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as connection:
+        connection.sendall("\r\n".join([f"GET {target} HTTP/1.1", *headers, "", ""]).encode("latin-1", "surrogateescape"))
         data = b""
         with contextlib.suppress(ConnectionResetError):
             while block := connection.recv(1 << 16):
@@ -47,7 +42,7 @@ class Client:
         # With an unlimited queue of unread messages, the socket answers the server's pings even if the test reads nothing.
         parts = urlsplit(url)
         settings = {"origin": f"http://{parts.netloc}", **settings}
-        self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
+        self.socket = connect(f"ws://{parts.netloc}{parts.path}", compression=None, max_size=None,
                               max_queue=None, ping_interval=None, open_timeout=PATIENCE, **settings).__enter__()
         self.messages: list[dict[str, Any]] = []
 

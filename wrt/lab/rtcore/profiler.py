@@ -24,11 +24,10 @@ from wrt.kernels.traverse.observer import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
 from wrt.renderer.film import Rectangle
-from wrt.renderer.options import Options, ProfileOptions, Progress
+from wrt.renderer.options import OF_A_PROFILE, Options, Progress, RenderOptions, split
 from wrt.renderer.plan import plan_of
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
-from wrt.scene.settings import SETTINGS
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -144,7 +143,7 @@ class Profile:
         write_table(path, columns | {name: rays.counts[name] for name in COUNTERS} | {"lines": rays.lines})
 
 
-def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -> Profile:
+def profile(scene: Scene | Mesh | PathLike, **options: Unpack[RenderOptions]) -> Profile:
     """Render a scene and record the cost of each ray.
 
     The rays are exactly those of `wrt.render` with the same arguments. The addresses of their fetches are recorded for evenly spaced
@@ -155,8 +154,8 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     scene : Scene, Mesh or path
         As for `wrt.render`.
     **options
-        Settings and options of `wrt.render`, listed in `ProfileOptions`. The default of `spp` is the value of a Scene or a TOML
-        file, else 1. `progress` counts the samples of three passes over the picture.
+        Settings of `wrt.render`, and its options in `wrt.renderer.options.OF_A_PROFILE`. The default of `spp` is the value of a Scene or
+        a TOML file, else 1. `progress` counts the samples of three passes over the picture.
 
     Returns
     -------
@@ -167,11 +166,7 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     InputError
         An unknown argument, a scene that cannot be rendered, or more rays than fit into memory.
     """
-    others: dict[str, Any] = {**options}
-    settings = {name: others.pop(name) for name in SETTINGS if name in others}
-    for name in others:
-        if name not in ProfileOptions.__optional_keys__:
-            raise InputError("is not an argument of wrt.profile", argument=name)
+    settings, others = split(options, "profile", OF_A_PROFILE)
     if not isinstance(scene, Scene | Mesh) and os.fspath(scene).endswith(".toml"):
         scene = as_scene(scene)
     if settings.get("spp") is None and not isinstance(scene, Scene):

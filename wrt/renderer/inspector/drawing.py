@@ -13,9 +13,10 @@ from wrt.core.files import write_bytes
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.renderer.inspector.section import Plane, cut, plane_of
-from wrt.renderer.inspector.tree import AMBIENT, InspectedPixel, Light, Ray, Sample, color
-from wrt.scene.materials import Material
-from wrt.scene.model import Scene
+from wrt.renderer.inspector.tree import AMBIENT, Inspection, Light, Ray, Sample, color
+from wrt.scene.model import Object, Scene
+from wrt.scene.shapes import icosphere
+from wrt.scene.values import shift
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +26,7 @@ FILES = (".png", ".svg", ".pdf")
 SIZE, DPI = (8.0, 5.4), 150  # inches, and pixels per inch
 COLORS = {"camera": "#202020", "reflected": "#1668c4", "coated": "#0b8f9c", "refracted": "#d1342b", "transmitted": "#c2378f",
           "onward": "#2b8a3e", "shadow ray": "#e59a00", "blocked": "#8a7f70"}
+SHADOWS = ("shadow ray", "blocked")  # the keys of COLORS of dashed lines
 OUTLINES = {"clear": "#4f8fb5", "emissive": "#c99a10", "opaque": "#6d6455"}
 # A marker of matplotlib for each end of a ray, and its description.
 ENDS = {"absorbed": ("o", "ends at a surface"), "emission": ("*", "ends at a light"), "missed": (">", "leaves the scene"),
@@ -48,7 +50,7 @@ class Stroke(NamedTuple):
 
     @property
     def is_shadow(self) -> bool:
-        return self.kind in ("shadow ray", "blocked")
+        return self.kind in SHADOWS
 
     @property
     def width(self) -> float:
@@ -100,7 +102,7 @@ def frame_points(sample: Sample) -> np.ndarray:
 # --- the drawing ------------------------------------------------------------------------------------------------------
 
 
-def figure(inspection: InspectedPixel, index: int | None) -> "Figure":
+def figure(inspection: Inspection, index: int | None) -> "Figure":
     """Return the drawing; Inspection.figure describes the arguments and errors."""
     sample = sample_of(inspection, index)
     with needed_by("drawing rays"):
@@ -112,7 +114,7 @@ def figure(inspection: InspectedPixel, index: int | None) -> "Figure":
     (x, y), title = inspection.pixel, inspection.scene.name or "scene"
     drawn.suptitle(f"{title}: pixel {x},{y}, sample {sample.index}, radiance {color(sample.radiance)}", fontsize=10)
     kinds, marks = {stroke.kind for stroke in strokes}, {stroke.mark for stroke in strokes}
-    handles = [Line2D([], [], color=shade, lw=1.8, ls="--" if kind in ("shadow ray", "blocked") else "-", label=kind)
+    handles = [Line2D([], [], color=shade, lw=1.8, ls="--" if kind in SHADOWS else "-", label=kind)
                for kind, shade in COLORS.items() if kind in kinds]
     handles += [Line2D([], [], color="#555555", marker=mark, ls="", ms=5.5, label=text)
                 for name, (mark, text) in ENDS.items() if name in marks and name != "blocked"]
@@ -120,7 +122,7 @@ def figure(inspection: InspectedPixel, index: int | None) -> "Figure":
     return drawn
 
 
-def save(inspection: InspectedPixel, path: PathLike, index: int | None) -> None:
+def save(inspection: Inspection, path: PathLike, index: int | None) -> None:
     """Write the drawing; Inspection.save describes the arguments and errors."""
     target = require_drawable(path)
     drawn, file = figure(inspection, index), io.BytesIO()
@@ -136,18 +138,16 @@ def require_drawable(path: PathLike) -> Path:
     return target
 
 
-def sample_of(inspection: InspectedPixel, index: int | None) -> Sample:
+def sample_of(inspection: Inspection, index: int | None) -> Sample:
     """Return the sample with an index, or the first sample for None. Raises InputError if it is missing or has no ray."""
     known = {sample.index: sample for sample in inspection.samples}
     sample = inspection.samples[0] if index is None else known.get(index)
-    if sample is None:
-        raise InputError(f"must be an inspected sample ({min(known)} to {max(known)}), got {index}", argument="sample")
-    if sample.root is None:
-        raise InputError("cannot be drawn: the camera has no ray here", argument="sample")
+    if sample is None or sample.root is None:
+        raise InputError(f"must be an inspected sample with a ray ({min(known)} to {max(known)}), got {index}", argument="sample")
     return sample
 
 
-def draw_section(axes: "Axes", inspection: InspectedPixel, sample: Sample) -> list[Stroke]:
+def draw_section(axes: "Axes", inspection: Inspection, sample: Sample) -> list[Stroke]:
     """Draw the outlines of the shapes that the plane of the rays cuts, and the rays over them; return the rays' lines."""
     plane, shown = plane_of(sample, inspection.camera), frame_points(sample)
     points, ratio = plane.project(shown), SIZE[0] / (SIZE[1] - 1.0)
@@ -155,19 +155,15 @@ def draw_section(axes: "Axes", inspection: InspectedPixel, sample: Sample) -> li
     half = MARGIN * max(high[0] - low[0], ratio * (high[1] - low[1])) * np.array([1.0, 1.0 / ratio])
     low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor="#fbfaf8")
+    axes.set_title("section by the plane of the rays, onto which other rays are projected", fontsize=8, color="#5c564c")
     draw_outlines(axes, inspection.scene, plane, low, high)
-    extent = float((high - low).max())
-    strokes = [stroke for _, stroke in strokes_of(sample, extent)]
+    strokes = [stroke for _, stroke in strokes_of(sample, float((high - low).max()))]
     for stroke in strokes:
         draw_stroke(axes, stroke, plane.project(np.array([stroke.start, stroke.end])))
     camera = "camera" if np.allclose(shown[0], sample.rays[0].origin) else "from the camera"
     for name, point in {camera: shown[0], **{stroke.light: stroke.end for stroke in strokes if stroke.light}}.items():
-        x, y = plane.project(point)
-        axes.annotate(name, (x, y), (4, 5), textcoords="offset points", fontsize=8, annotation_clip=True).set_in_layout(False)
-    ends = np.array([(stroke.start, stroke.end) for stroke in strokes if stroke.mark != "missed"])
-    off = float(np.abs(plane.distance(ends)).max()) if len(ends) else 0.0
-    note = f"; rays that leave it, by up to {off:.2g} units, are projected onto it" if off > 1e-3 * extent else ""
-    axes.set_title(f"section by the plane of the rays{note}", fontsize=8, color="#5c564c")
+        axes.annotate(name, tuple(plane.project(point)), (4, 5), textcoords="offset points", fontsize=8,
+                      annotation_clip=True).set_in_layout(False)
     return strokes
 
 
@@ -175,34 +171,30 @@ def draw_outlines(axes: "Axes", scene: Scene, plane: Plane, low: np.ndarray, hig
     """Draw the sections of all shapes that the plane cuts, each with its name at its highest part between the corners of the drawing."""
     from matplotlib.collections import LineCollection
 
-    found: list[tuple[str, Material, np.ndarray]] = []
-    for i, thing in enumerate(scene.objects):
-        vertices = thing.mesh.vertices.astype(np.float64) @ thing.placement[:3, :3].T + thing.placement[:3, 3]
-        found.append((thing.name or f"object {i}", thing.materials[0], cut(vertices[thing.mesh.faces], plane)))
+    named = [(thing.name or f"object {i}", thing) for i, thing in enumerate(scene.objects)]
     for i, sphere in enumerate(scene.spheres):
-        squared = sphere.radius**2 - float(plane.distance(np.array(sphere.center))) ** 2
-        angle = np.linspace(0.0, 2.0 * np.pi, 181 if squared > 0.0 else 0)
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) * math.sqrt(max(squared, 0.0)) + plane.project(np.array(sphere.center))
-        found.append((sphere.name or f"sphere {i}", sphere.material, np.stack([circle[:-1], circle[1:]], axis=1)))
-    for name, material, lines in found:
+        ball = Object(icosphere(4, sphere.radius), (sphere.material,), shift(np.array(sphere.center)))
+        named.append((sphere.name or f"sphere {i}", ball))
+    for name, thing in named:
+        vertices = thing.mesh.vertices.astype(np.float64) @ thing.placement[:3, :3].T + thing.placement[:3, 3]
+        lines, material = cut(vertices[thing.mesh.faces], plane), thing.materials[0]
         shade = OUTLINES["clear" if material.is_clear else "emissive" if material.is_emissive else "opaque"]
         axes.add_collection(LineCollection(list(lines), colors=shade, linewidths=1.6, capstyle="round", zorder=1))
         ends = lines.reshape(-1, 2)
         inside = ends[((ends > low) & (ends < high)).all(axis=1)]
         if len(inside):
-            top = inside[inside[:, 1].argmax()]
-            axes.annotate(name, (top[0], top[1]), (0, 3), textcoords="offset points", fontsize=7.5, ha="center", color=shade,
-                          zorder=7).set_in_layout(False)
+            axes.annotate(name, tuple(inside[inside[:, 1].argmax()]), (0, 3), textcoords="offset points", fontsize=7.5, ha="center",
+                          color=shade, zorder=7).set_in_layout(False)
 
 
 def draw_stroke(axes: "Axes", stroke: Stroke, ends: np.ndarray) -> None:
     """Draw a line from ends[0] to ends[1], (2, 2), with an arrow in the middle of a path and a marker at the end."""
     shade, order = COLORS[stroke.kind], 3 if stroke.is_shadow else 4
     axes.plot(*ends.T, color=shade, linewidth=stroke.width, zorder=order, linestyle=(0, (3, 1.6)) if stroke.is_shadow else "-")
-    if stroke.mark and stroke.mark != "missed":
+    if stroke.mark:
         axes.plot(*ends[1], marker=ENDS[stroke.mark][0], color=shade, ms=6.0, mec=shade if stroke.mark == "blocked" else "white", zorder=6)
-    along = ends[1] - ends[0]
-    for share in ([] if stroke.is_shadow else [0.55]) + ([0.98] if stroke.mark == "missed" else []):
-        axes.annotate("", ends[0] + (share + 0.02) * along, ends[0] + share * along, zorder=order, annotation_clip=True,
+    if not stroke.is_shadow:
+        along = ends[1] - ends[0]
+        axes.annotate("", ends[0] + 0.57 * along, ends[0] + 0.55 * along, zorder=order, annotation_clip=True,
                       arrowprops={"arrowstyle": "-|>", "lw": 0.0, "mutation_scale": 8.0 + 3.0 * stroke.width, "color": shade,
                                   "shrinkA": 0.0, "shrinkB": 0.0})

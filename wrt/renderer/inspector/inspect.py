@@ -3,87 +3,32 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Unpack
+from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.snapshot import WrappedStructure
-from wrt.core.checks import as_integer, as_tuple, shown, unknown
+from wrt.core.checks import as_integer, as_tuple, shown
 from wrt.core.device import on_host, start
 from wrt.core.errors import InputError
 from wrt.io.load import as_scene
 from wrt.kernels.loops import record
 from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.inspector.assemble import Assembler
-from wrt.renderer.inspector.tree import InspectedPixel, Sample
-from wrt.renderer.options import Options, PixelOptions
+from wrt.renderer.inspector.tree import Inspection, Sample
+from wrt.renderer.options import OF_A_PIXEL, Options, RenderOptions, split
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import prepare
 from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
-from wrt.scene.settings import SETTINGS, SettingChanges
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from wrt.core.types import PathLike
-
-# The options of `render` that choose a pixel's bits, or how they are computed.
-OPTIONS = ("seed", "device", "threads", "accel", "accel_options", "triangle", "box", "instancing", "camera")
-
-
-@dataclass(frozen=True, eq=False)
-class Inspection(InspectedPixel):
-    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
-
-    Parameters
-    ----------
-    scene
-        The inspected scene, with the settings of the inspection.
-    camera
-        The camera of the picture.
-    pixel, size
-        x and y from the top left; width and height of the picture.
-    seed
-        Seed of the samples.
-    samples
-        The inspected samples: all samples of the pixel, or one.
-    """
-
-    def figure(self, sample: int | None = None) -> Figure:
-        """Draw the rays of one sample in the plane that holds most of them, with the outlines of the shapes that it cuts.
-
-        Parameters
-        ----------
-        sample
-            Index of the sample to draw. None: the first.
-
-        Returns
-        -------
-        Figure
-            A figure of matplotlib, which a notebook shows, and `save` writes.
-
-        Raises
-        ------
-        InputError
-            If matplotlib is missing, the sample was not inspected, or it has no ray.
-        """
-        from wrt.renderer.inspector.drawing import figure  # without the drawing, an inspection imports less
-
-        return figure(self, sample)
-
-    def save(self, path: PathLike, sample: int | None = None) -> None:
-        """Write `figure(sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
-        from wrt.renderer.inspector.drawing import save
-
-        save(self, path, sample)
+from wrt.scene.settings import SettingChanges
 
 
 def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int], sample: int | None = None,
-            **options: Unpack[PixelOptions]) -> Inspection:
+            **options: Unpack[RenderOptions]) -> Inspection:
     """Trace one pixel as `render` does, and return all of its rays.
 
     The kernel that renders also records. So the sum over the tree is the pixel of `render` with the same options, bit for bit.
@@ -116,10 +61,10 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
     >>> print(tree)
     >>> tree.save("rays.svg")
     """
-    keywords: dict[str, Any] = {**options}
-    scene = as_scene(scene).with_settings(**{name: keywords.pop(name) for name in SETTINGS if name in keywords})
+    changes, others = split(options, "inspect", OF_A_PIXEL)
+    scene = as_scene(scene).with_settings(**changes)
     as_pixel(pixel, scene.settings.size)  # before kernels are compiled
-    return Inspector(scene, **keywords).pixel(pixel, sample)
+    return Inspector(scene, **others).pixel(pixel, sample)
 
 
 # The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
@@ -131,13 +76,9 @@ class Inspector:
 
     Its render kernel runs over a structure that records the rays (wrt.kernels.loops.record)."""
 
-    def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[PixelOptions]) -> None:
-        keywords: dict[str, Any] = {**options}
-        changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
-        for name in keywords:
-            if name not in OPTIONS:
-                raise unknown(name, "argument of inspect", (*SETTINGS, *OPTIONS), argument=name)
-        resolved = Options(**keywords)
+    def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[RenderOptions]) -> None:
+        changes, others = split(options, "inspect", OF_A_PIXEL)
+        resolved = Options(**others)
         self.scene = as_scene(scene).with_settings(**changes)
         plan = plan_of(self.scene, resolved)
         self.camera, self.seed = plan.camera, resolved.seed

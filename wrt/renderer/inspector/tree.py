@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.core.types import JsonObject
+from wrt.core.types import JsonObject, PathLike
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from wrt.scene.cameras import CameraKind
     from wrt.scene.model import Scene
 
@@ -122,8 +124,20 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class InspectedPixel:
-    """The data of an Inspection (wrt.renderer.inspector.inspect), which documents the fields."""
+class Inspection:
+    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
+
+    Parameters
+    ----------
+    scene, camera
+        The inspected scene, with the settings of the inspection, and the camera of the picture.
+    pixel, size
+        x and y from the top left; width and height of the picture.
+    seed
+        Seed of the samples.
+    samples
+        The inspected samples: all samples of the pixel, or one.
+    """
 
     scene: "Scene" = field(repr=False)
     camera: "CameraKind" = field(repr=False)
@@ -169,6 +183,21 @@ class InspectedPixel:
         head = {"scene": self.scene.name, "camera": self.camera.name, "pixel": list(self.pixel), "size": list(self.size), "seed": self.seed}
         samples = [{"index": each.index, "radiance": each.radiance.tolist(), "rays": _table(each.rays)} for each in self.samples]
         return head | {"radiance": self.radiance.tolist(), "samples": samples}
+
+    def figure(self, sample: int | None = None) -> "Figure":
+        """Draw the rays of one sample with matplotlib, in the plane that holds most of them, with the outlines of the shapes there.
+
+        sample: index of the sample; None: the first. Raises InputError if matplotlib is missing, the sample was not inspected, or it has
+        no ray."""
+        from wrt.renderer.inspector.drawing import figure  # without the drawing, an inspection imports less
+
+        return figure(self, sample)
+
+    def save(self, path: PathLike, sample: int | None = None) -> None:
+        """Write `figure(sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
+        from wrt.renderer.inspector.drawing import save
+
+        save(self, path, sample)
 
 
 def _table(rays: tuple[Ray, ...]) -> list[JsonObject]:

@@ -13,7 +13,6 @@ const rows = new Map();  // of the panel, by the control's name
 function connect() {
   const address = new URL("socket", location.href);
   address.protocol = address.protocol.replace("http", "ws");
-  address.search = "";
   socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { activity(""); sendSize(); };
@@ -60,8 +59,6 @@ async function showPicture(head, blob) {
   by("status").replaceChildren(...head.lines.flatMap(line => [line, document.createElement("br")]));
   by("done").style.width = `${100 * head.done}%`;
   by("line").textContent = `${head.lines[0]}, ${head.left}`;
-  by("legend").hidden = !head.legend;
-  by("counts").textContent = head.legend;
   by("camera").textContent = head.camera;
   document.body.dataset.pictures = turn;
 }
