@@ -214,7 +214,7 @@ WRONG = [
     (["--crop", "²,0,1,1"], "write X0,Y0,X1,Y1"), (["--crop", "0,0,1," + HUGE], "write X0,Y0,X1,Y1"),
     (["--accel", "nope"], "no structure 'nope'; there is bvh"), (["--device", "nope"], "no device 'nope'; there is cpu"),
     (["--filter", "nope"], "filter must be one of box"), (["--fresnel", "nope"], "fresnel must be one of exact"),
-    (["--tonemap", "nope"], "tonemap must be one of none"), (["--aov", "depth,nope"], "no AOV nope; there is depth"),
+    (["--tonemap", "nope"], "tonemap must be one of none"), (["--aov", "depth,nope"], "no AOV 'nope'"),
     (["--bits", "7"], ".png is written with 8 or 16 bits, not 7"),
     (["--threads", "0"], "threads must be 1 or more"), (["--threads", "-2"], "threads must be 1 or more"),
     (["--max-depth", "-1"], "max_depth must be 0 to 64"), (["--max-depth", "65"], "max_depth must be 0 to 64"),

@@ -214,7 +214,7 @@ def test_completion(arguments: list[str], incomplete: str, expected: list[str]) 
     (["render", "box.obj", "--accel", "bhv"], "no structure 'bhv'; did you mean 'bvh'? there is bvh, "),
     (["render", "box.obj", "--filter", "gausian"], "got 'gausian'; did you mean 'gaussian'?"),
     (["render", "box.obj", "--instancing", "alwys"], "got 'alwys'; did you mean 'always'?"),
-    (["render", "box.obj", "--aov", "dept"], "no AOV dept; did you mean 'depth'? there is depth"),
+    (["render", "box.obj", "--aov", "dept"], "no AOV 'dept'; did you mean 'depth'?"),
     (["bench", "queries", "gird:density=4"], "no contestant 'gird'; did you mean 'grid'?"),
     (["profile", "box.obj", "--gpu", "rtx2080"], "no GPU 'rtx2080'; did you mean 'rtx2080ti'?"),
     (["rendr"], "No such command 'rendr'. Did you mean 'render'?"), (["bench", "foo"], "No such command 'foo'."),
