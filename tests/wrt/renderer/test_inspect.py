@@ -16,9 +16,9 @@ from tests.inspect_all import SCENES, differing_pixels
 from tests.refused import refused
 from wrt.cli.common import json_text
 from wrt.kernels.shade.follow_up import CUT_BY_DEPTH
-from wrt.renderer.inspector.inspect import Inspector
+from wrt.renderer.inspector.inspect import Inspection, Inspector
 from wrt.renderer.inspector.section import Plane, cut, plane_of
-from wrt.renderer.inspector.tree import Inspection, Ray
+from wrt.renderer.inspector.tree import Ray
 from wrt.scene.shapes import box
 
 # Each compiles for seconds; together they have most kinds of rays. The slow tests inspect all scenes.

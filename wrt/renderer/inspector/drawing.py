@@ -1,6 +1,5 @@
 """A drawing of a sample's rays with matplotlib: the section of the scene by the plane that holds most of them."""
 
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,11 +8,11 @@ import numpy as np
 
 from wrt.core.checks import as_path
 from wrt.core.errors import InputError
-from wrt.core.files import write_bytes
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.renderer.inspector.section import Plane, cut, plane_of
-from wrt.renderer.inspector.tree import AMBIENT, Inspection, Light, Ray, Sample, color
+from wrt.renderer.inspector.tree import AMBIENT, Light, Ray, Sample, color
+from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 from wrt.scene.values import shift
@@ -102,17 +101,16 @@ def frame_points(sample: Sample) -> np.ndarray:
 # --- the drawing ------------------------------------------------------------------------------------------------------
 
 
-def figure(inspection: Inspection, index: int | None) -> "Figure":
-    """Return the drawing; Inspection.figure describes the arguments and errors."""
-    sample = sample_of(inspection, index)
+def figure(scene: Scene, camera: CameraKind, pixel: tuple[int, int], sample: Sample) -> "Figure":
+    """Return the drawing of a sample with a ray."""
     with needed_by("drawing rays"):
         from matplotlib.figure import Figure
         from matplotlib.lines import Line2D
 
     drawn = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
-    strokes = draw_section(drawn.subplots(), inspection, sample)
-    (x, y), title = inspection.pixel, inspection.scene.name or "scene"
-    drawn.suptitle(f"{title}: pixel {x},{y}, sample {sample.index}, radiance {color(sample.radiance)}", fontsize=10)
+    strokes = draw_section(drawn.subplots(), scene, camera, sample)
+    of = f"pixel {pixel[0]},{pixel[1]}, sample {sample.index}, radiance {color(sample.radiance)}"
+    drawn.suptitle(f"{scene.name or 'scene'}: {of}", fontsize=10)
     kinds, marks = {stroke.kind for stroke in strokes}, {stroke.mark for stroke in strokes}
     handles = [Line2D([], [], color=shade, lw=1.8, ls="--" if kind in SHADOWS else "-", label=kind)
                for kind, shade in COLORS.items() if kind in kinds]
@@ -120,14 +118,6 @@ def figure(inspection: Inspection, index: int | None) -> "Figure":
                 for name, (mark, text) in ENDS.items() if name in marks and name != "blocked"]
     drawn.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), fontsize=8, frameon=False)
     return drawn
-
-
-def save(inspection: Inspection, path: PathLike, index: int | None) -> None:
-    """Write the drawing; Inspection.save describes the arguments and errors."""
-    target = require_drawable(path)
-    drawn, file = figure(inspection, index), io.BytesIO()
-    drawn.savefig(file, format=target.suffix.lower()[1:])
-    write_bytes(target, file.getvalue())
 
 
 def require_drawable(path: PathLike) -> Path:
@@ -138,30 +128,21 @@ def require_drawable(path: PathLike) -> Path:
     return target
 
 
-def sample_of(inspection: Inspection, index: int | None) -> Sample:
-    """Return the sample with an index, or the first sample for None. Raises InputError if it is missing or has no ray."""
-    known = {sample.index: sample for sample in inspection.samples}
-    sample = inspection.samples[0] if index is None else known.get(index)
-    if sample is None or sample.root is None:
-        raise InputError(f"must be an inspected sample with a ray ({min(known)} to {max(known)}), got {index}", argument="sample")
-    return sample
-
-
-def draw_section(axes: "Axes", inspection: Inspection, sample: Sample) -> list[Stroke]:
+def draw_section(axes: "Axes", scene: Scene, camera: CameraKind, sample: Sample) -> list[Stroke]:
     """Draw the outlines of the shapes that the plane of the rays cuts, and the rays over them; return the rays' lines."""
-    plane, shown = plane_of(sample, inspection.camera), frame_points(sample)
+    plane, shown = plane_of(sample, camera), frame_points(sample)
     points, ratio = plane.project(shown), SIZE[0] / (SIZE[1] - 1.0)
     low, high = points.min(axis=0), points.max(axis=0)
     half = MARGIN * max(high[0] - low[0], ratio * (high[1] - low[1])) * np.array([1.0, 1.0 / ratio])
     low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor="#fbfaf8")
     axes.set_title("section by the plane of the rays, onto which other rays are projected", fontsize=8, color="#5c564c")
-    draw_outlines(axes, inspection.scene, plane, low, high)
+    draw_outlines(axes, scene, plane, low, high)
     strokes = [stroke for _, stroke in strokes_of(sample, float((high - low).max()))]
     for stroke in strokes:
         draw_stroke(axes, stroke, plane.project(np.array([stroke.start, stroke.end])))
-    camera = "camera" if np.allclose(shown[0], sample.rays[0].origin) else "from the camera"
-    for name, point in {camera: shown[0], **{stroke.light: stroke.end for stroke in strokes if stroke.light}}.items():
+    eye = "camera" if np.allclose(shown[0], sample.rays[0].origin) else "from the camera"
+    for name, point in {eye: shown[0], **{stroke.light: stroke.end for stroke in strokes if stroke.light}}.items():
         axes.annotate(name, tuple(plane.project(point)), (4, 5), textcoords="offset points", fontsize=8,
                       annotation_clip=True).set_in_layout(False)
     return strokes

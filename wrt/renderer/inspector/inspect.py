@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
-from dataclasses import replace
-from typing import Unpack
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import warp as wp
@@ -13,11 +14,13 @@ from wrt.accel.snapshot import WrappedStructure
 from wrt.core.checks import as_integer, as_tuple, shown
 from wrt.core.device import on_host, start
 from wrt.core.errors import InputError
+from wrt.core.files import write_bytes
+from wrt.core.types import JsonObject, PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.loops import record
 from wrt.renderer.film import DeviceFilm, Work
 from wrt.renderer.inspector.assemble import Assembler
-from wrt.renderer.inspector.tree import Inspection, Sample
+from wrt.renderer.inspector.tree import Sample, as_table, color, ray_lines
 from wrt.renderer.options import OF_A_PIXEL, Options, RenderOptions, split
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import prepare
@@ -25,6 +28,94 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST = 4  # samples that are printed
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
+
+    Parameters
+    ----------
+    scene, camera
+        The inspected scene, with the settings of the inspection, and the camera of the picture.
+    pixel, size
+        x and y from the top left; width and height of the picture.
+    seed
+        Seed of the samples.
+    samples
+        The inspected samples: all samples of the pixel, or one.
+    """
+
+    scene: Scene = field(repr=False)
+    camera: CameraKind = field(repr=False)
+    pixel: tuple[int, int]
+    size: tuple[int, int]
+    seed: int
+    samples: tuple[Sample, ...] = field(repr=False)
+
+    @property
+    def radiance(self) -> np.ndarray:
+        """The mean of the samples, (3,) float32: the bits of the pixel that `render` returns if all samples are inspected.
+
+        The film keeps a running mean in float32, mean += (sample - mean) / n, to which a sample that is not finite adds black,
+        and a sample over the setting `clamp` its scaled radiance."""
+        mean, limit = np.zeros(3, np.float32), np.float32(self.scene.settings.clamp)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for n, sample in enumerate(self.samples, 1):
+                radiance = sample.radiance
+                radiance = radiance if np.isfinite(radiance.sum()) else np.zeros(3, np.float32)
+                if 0.0 < limit < radiance.max():
+                    radiance = (limit / radiance.max()) * radiance
+                mean = mean + (radiance - mean) / np.float32(n)
+        return mean
+
+    def __str__(self) -> str:
+        """Return the trees of the first MOST samples, one line for each ray and each light, below a line with the pixel's radiance."""
+        (x, y), (width, height), samples = self.pixel, self.size, self.samples
+        of = f"sample {samples[0].index}" if len(samples) == 1 else f"the mean of {len(samples)} samples"
+        lines = [f"pixel {x},{y} of {width}x{height}, {self.scene.name or 'scene'}: radiance {color(self.radiance)}, {of}"]
+        for sample in samples[:MOST]:
+            if len(samples) > 1:
+                lines.append(f"sample {sample.index}: radiance {color(sample.radiance)}")
+            lines += ["the camera has no ray here"] if sample.root is None else ray_lines(sample.root, "", "")
+        if len(samples) > MOST:
+            lines.append(f"and {len(samples) - MOST} more samples")
+        return "\n".join(lines)
+
+    def to_dict(self) -> JsonObject:
+        """Return the samples as a JSON object: the fields of Inspection, Sample, Ray and Light, with rays as a flat list.
+
+        A ray has "parent", the index of the ray at whose hit it begins (None for the camera ray), in place of "children".
+        Infinity and NaN stay numbers, which JSON lacks: `python -m wrt inspect --json` writes null."""
+        head = {"scene": self.scene.name, "camera": self.camera.name, "pixel": list(self.pixel), "size": list(self.size), "seed": self.seed}
+        samples = [{"index": each.index, "radiance": each.radiance.tolist(), "rays": as_table(each.rays)} for each in self.samples]
+        return head | {"radiance": self.radiance.tolist(), "samples": samples}
+
+    def figure(self, sample: int | None = None) -> Figure:
+        """Draw the rays of one sample with matplotlib, in the plane that holds most of them, with the outlines of the shapes there.
+
+        sample: index of the sample; None: the first. Raises InputError if matplotlib is missing, the sample was not inspected, or it has
+        no ray."""
+        from wrt.renderer.inspector.drawing import figure  # without the drawing, an inspection imports less
+
+        known = {each.index: each for each in self.samples}
+        chosen = self.samples[0] if sample is None else known.get(sample)
+        if chosen is None or chosen.root is None:
+            raise InputError(f"must be an inspected sample with a ray ({min(known)} to {max(known)}), got {sample}", argument="sample")
+        return figure(self.scene, self.camera, self.pixel, chosen)
+
+    def save(self, path: PathLike, sample: int | None = None) -> None:
+        """Write `figure(sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
+        from wrt.renderer.inspector.drawing import require_drawable
+
+        target, file = require_drawable(path), io.BytesIO()
+        self.figure(sample).savefig(file, format=target.suffix.lower()[1:])
+        write_bytes(target, file.getvalue())
 
 
 def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int], sample: int | None = None,

@@ -2,20 +2,12 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from wrt.core.types import JsonObject, PathLike
+from wrt.core.types import JsonObject
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from wrt.scene.cameras import CameraKind
-    from wrt.scene.model import Scene
-
-MOST = 4  # samples that are printed
 AMBIENT = "ambient term"  # name of the light that stands for the ambient term, with ambient occlusion
 
 
@@ -123,84 +115,7 @@ class Sample:
         return total
 
 
-@dataclass(frozen=True, eq=False)
-class Inspection:
-    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
-
-    Parameters
-    ----------
-    scene, camera
-        The inspected scene, with the settings of the inspection, and the camera of the picture.
-    pixel, size
-        x and y from the top left; width and height of the picture.
-    seed
-        Seed of the samples.
-    samples
-        The inspected samples: all samples of the pixel, or one.
-    """
-
-    scene: "Scene" = field(repr=False)
-    camera: "CameraKind" = field(repr=False)
-    pixel: tuple[int, int]
-    size: tuple[int, int]
-    seed: int
-    samples: tuple[Sample, ...] = field(repr=False)
-
-    @property
-    def radiance(self) -> np.ndarray:
-        """The mean of the samples, (3,) float32: the bits of the pixel that `render` returns if all samples are inspected.
-
-        The film keeps a running mean in float32, mean += (sample - mean) / n, to which a sample that is not finite adds black,
-        and a sample over the setting `clamp` its scaled radiance."""
-        mean, limit = np.zeros(3, np.float32), np.float32(self.scene.settings.clamp)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for n, sample in enumerate(self.samples, 1):
-                radiance = sample.radiance
-                radiance = radiance if np.isfinite(radiance.sum()) else np.zeros(3, np.float32)
-                if 0.0 < limit < radiance.max():
-                    radiance = (limit / radiance.max()) * radiance
-                mean = mean + (radiance - mean) / np.float32(n)
-        return mean
-
-    def __str__(self) -> str:
-        """Return the trees of the first MOST samples, one line for each ray and each light, below a line with the pixel's radiance."""
-        (x, y), (width, height), samples = self.pixel, self.size, self.samples
-        of = f"sample {samples[0].index}" if len(samples) == 1 else f"the mean of {len(samples)} samples"
-        lines = [f"pixel {x},{y} of {width}x{height}, {self.scene.name or 'scene'}: radiance {color(self.radiance)}, {of}"]
-        for sample in samples[:MOST]:
-            if len(samples) > 1:
-                lines.append(f"sample {sample.index}: radiance {color(sample.radiance)}")
-            lines += ["the camera has no ray here"] if sample.root is None else ray_lines(sample.root, "", "")
-        if len(samples) > MOST:
-            lines.append(f"and {len(samples) - MOST} more samples")
-        return "\n".join(lines)
-
-    def to_dict(self) -> JsonObject:
-        """Return the samples as a JSON object: the fields of Inspection, Sample, Ray and Light, with rays as a flat list.
-
-        A ray has "parent", the index of the ray at whose hit it begins (None for the camera ray), in place of "children".
-        Infinity and NaN stay numbers, which JSON lacks: `python -m wrt inspect --json` writes null."""
-        head = {"scene": self.scene.name, "camera": self.camera.name, "pixel": list(self.pixel), "size": list(self.size), "seed": self.seed}
-        samples = [{"index": each.index, "radiance": each.radiance.tolist(), "rays": _table(each.rays)} for each in self.samples]
-        return head | {"radiance": self.radiance.tolist(), "samples": samples}
-
-    def figure(self, sample: int | None = None) -> "Figure":
-        """Draw the rays of one sample with matplotlib, in the plane that holds most of them, with the outlines of the shapes there.
-
-        sample: index of the sample; None: the first. Raises InputError if matplotlib is missing, the sample was not inspected, or it has
-        no ray."""
-        from wrt.renderer.inspector.drawing import figure  # without the drawing, an inspection imports less
-
-        return figure(self, sample)
-
-    def save(self, path: PathLike, sample: int | None = None) -> None:
-        """Write `figure(sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
-        from wrt.renderer.inspector.drawing import save
-
-        save(self, path, sample)
-
-
-def _table(rays: tuple[Ray, ...]) -> list[JsonObject]:
+def as_table(rays: tuple[Ray, ...]) -> list[JsonObject]:
     """Return the fields of each ray. A list has no limit of depth, as nested objects have."""
     parents = {id(child): i for i, ray in enumerate(rays) for child in ray.children}
     rows = []
