@@ -12,7 +12,7 @@ import numpy as np
 
 from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, at, warn
-from wrt.core.files import read_file, require_file, utf8
+from wrt.core.files import read_file, require_file
 from wrt.core.registry import Registry
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
@@ -112,31 +112,16 @@ LOADERS: Registry[Callable[..., Scene]] = Registry("scene format", {
 
 
 def _parse(path: Path) -> JsonObject:
+    with at(path=path):
+        data = read_file(path)
     try:
-        data = tomllib.loads(utf8(read_file(path)).decode())
-        _require_64_bits(data)
-        return data
-    except InputError as error:
-        raise error.at(path) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start} is not UTF-8 text", path=path) from error
+        return tomllib.loads(data.decode("utf-8-sig"))
     except RecursionError:
         raise InputError("is nested too deeply", path=path) from None
-    except tomllib.TOMLDecodeError as error:
-        message, place = str(error), None
-        if at := re.fullmatch(r"(.*) \(at (line \d+, column \d+|end of document)\)", message, re.DOTALL):
-            message, place = at.groups()
-        raise InputError(message, path=path, place=place) from error
-    except ValueError as error:  # Python's int refuses thousands of digits
-        raise InputError("holds a number of thousands of digits", path=path) from error
-
-
-def _require_64_bits(value: object) -> None:
-    """Raise InputError for an integer of more than 64 bits, which TOML forbids."""
-    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _require_64_bits(each)
-    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
-        raise InputError("holds an integer of more than 64 bits")
+    except ValueError as error:  # no TOML, no UTF-8, or an integer of thousands of digits
+        found = re.fullmatch(r"(.*?)(?: \(at (line \d+, column \d+|end of document)\))?", str(error), re.DOTALL)
+        what, place = found.groups() if found else (str(error), None)
+        raise InputError(what, path=path, place=place) from error
 
 
 def _staged(scene: Scene, path: PathLike, staging: Staging, notes: Sequence[str] = ()) -> Scene:

@@ -152,7 +152,7 @@ def test_warnings_do_not_grow_with_the_file(tmp_path: Path) -> None:
 
 
 def test_names_give_the_terminal_no_orders(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text('[[spheres]]\ncenter=[0,0,0]\nradius=1\nmaterial="\\u001b[2J"\n["\\u001b]0;x\\u0007"]\n')
+    (tmp_path / "a.toml").write_text('[[spheres]]\ncenter=[0,0,0]\nradius=1\nmaterial="\\u001b[2J\\u0007"\n[materials."\\u001b"]\n')
     result = command("validate", tmp_path / "a.toml")
     assert result.code == 2 and "unknown material" in result.err and "\x1b" not in result.err and "\x07" not in result.err
     file = one_triangle()

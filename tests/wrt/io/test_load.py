@@ -1,18 +1,14 @@
 from __future__ import annotations
 
-import base64
 import json
 import math
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.data import data_path
-from tests.gltf_files import one_triangle
+from tests.gltf_files import encode, one_triangle
 from tests.refused import refused
 from wrt.accel.scenes.flatten import flatten_joined
 from wrt.core.errors import InputError, SceneWarning
@@ -47,32 +43,17 @@ def errors(folder: Path, text: str) -> list[str]:
     return lines[1:] or lines
 
 
-def png(path: Path, pixels: np.ndarray) -> None:
-    """Write (H, W, 4) uint8."""
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
-    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", *pixels.shape[1::-1], 8, 6, 0, 0, 0))
-                     + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
-
-
-def gltf(path: Path) -> None:
-    """A triangle in z = 0 of a material "paint", a camera and a point light."""
-    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
-    path.write_text(json.dumps({
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1, 2]}],
-        "nodes": [{"mesh": 0}, {"camera": 0}, {"extensions": {"KHR_lights_punctual": {"light": 0}}}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
-        "materials": [{"name": "paint"}],
-        "cameras": [{"name": "theirs", "type": "perspective", "perspective": {"yfov": 0.5, "znear": 0.1}}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0],
-                       "max": [1, 1, 0]}],
-        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
-        "buffers": [{"byteLength": len(data),
-                     "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode()}],
-        "extensionsUsed": ["KHR_lights_punctual"],
-        "extensions": {"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 3.0}]}},
-    }))
+def gltf(folder: Path) -> None:
+    """Write model.glb: a triangle of a material "paint", moved by 1, a camera, and lights of each kind."""
+    file = one_triangle(material=0)
+    file.json |= {"materials": [{"name": "paint"}], "cameras": [{"type": "perspective", "perspective": {"yfov": 0.5, "znear": 0.1}}]}
+    file.json["nodes"][0]["translation"] = [1, 0, 0]
+    file.node(camera=0, translation=[0, 0, 3], name="eye")
+    kinds = [{"type": kind, "intensity": 3.0} for kind in ("point", "directional", "spot")]
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": kinds}}
+    for i in range(3):
+        file.node(translation=[1, 2, 3], extensions={"KHR_lights_punctual": {"light": i}})
+    file.write(folder, "model.glb")
 
 
 # --- the scene holds everything that the file says -------------------------------------------------------------------------
@@ -150,7 +131,7 @@ two_sided = true
 
 
 def test_materials_and_shapes(tmp_path: Path) -> None:
-    png(tmp_path / "t.png", np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
+    (tmp_path / "t.png").write_bytes(encode(np.arange(24, dtype=np.uint8).reshape(2, 3, 4)))
     scene = load(tmp_path, CAMERA + SUN + """
 [materials.gold]
 kind = "conductor"
@@ -217,25 +198,6 @@ def test_transforms(tmp_path: Path, transform: str, point: list[float], image: l
     np.testing.assert_allclose(scene.objects[0].transform @ [*point, 1], [*image, 1], atol=1e-12)
 
 
-def test_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
-    assert errors(tmp_path, f"ambient = {'9' * 5000}\n") == [
-        "holds a number of thousands of digits"]
-
-
-@pytest.mark.parametrize("value", [2**63, -(10**30), 10**400, int("9" * 4300)])
-@pytest.mark.parametrize("field", ["[settings]\nspp", "[settings]\nexposure", "ambient", "[[spheres]]\ncenter = [0, 0, 0]\nradius",
-                                   "[[meshes]]\nmaterial = 'm'\nfile = 'b.obj'\nparts = [{material = 'm', count = 9, first"])
-def test_integers_of_any_size_are_reported_in_short(field: str, value: int, tmp_path: Path) -> None:
-    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    end = "}]" if "parts" in field else ""
-    top, rest = (f"{field} = {value}\n", "") if field == "ambient" else ("", f"{field} = {value}{end}\n")
-    path = tmp_path / "a.toml"
-    path.write_text(f"{top}[materials.m]\n{rest}" if "settings" not in field else rest)
-    with pytest.raises(InputError) as error:
-        load_scene(path)
-    assert len(str(error.value)) < 400 and error.value.path == path
-
-
 def test_no_more_than_twenty_mistakes_are_listed(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         load(tmp_path, CAMERA + "[[spheres]]\n" * 10 + "".join(f"wrong_{i} = 1\n" for i in range(5)))
@@ -255,16 +217,7 @@ def test_instances_of_a_mesh_are_placed_before_its_transform(tmp_path: Path) -> 
 
 
 def including(folder: Path, transform: str) -> tuple[Scene, Scene]:
-    """A glTF file with a moved triangle, a camera and lights of each kind: alone, and included under a transform."""
-    file = one_triangle()
-    file.json["nodes"][0]["translation"] = [1, 0, 0]
-    file.json["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.5, "znear": 0.1}}]
-    file.node(camera=0, translation=[0, 0, 3], name="eye")
-    kinds = [{"type": kind, "intensity": 3.0} for kind in ("point", "directional", "spot")]
-    file.json["extensions"] = {"KHR_lights_punctual": {"lights": kinds}}
-    for i in range(3):
-        file.node(translation=[1, 2, 3], extensions={"KHR_lights_punctual": {"light": i}})
-    file.write(folder, "model.glb")
+    gltf(folder)
     plain = load(folder, 'include = ["model.glb"]\n')
     return plain, load(folder, f'[[include]]\nfile = "model.glb"\ntransform = {{ {transform} }}\n')
 
@@ -314,16 +267,6 @@ def test_environment(tmp_path: Path) -> None:
     assert scene.background.scale == 2 and scene.background.rotation == pytest.approx(math.pi / 4)
 
 
-def test_bad_pixels_of_an_environment_are_replaced_with_a_warning(tmp_path: Path) -> None:
-    from wrt.picture.image import write_image
-
-    write_image(tmp_path / "sky.exr", np.array([[[1, -0.001, 2], [np.inf, 3, 4]]], np.float32))
-    with pytest.warns(SceneWarning, match=r"sky\.exr: 2 pixels negative, NaN or infinite"):
-        scene = load(tmp_path, CAMERA + '[background]\ntype = "environment"\nfile = "sky.exr"\n')
-    assert isinstance(scene.background, EnvironmentBackground)
-    assert scene.background.image.tolist() == [[[1, 0, 2], [65504, 3, 4]]]
-
-
 def test_mesh_materials(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text(TRIANGLES + "usemtl a\nf 1 2 3\nf 1 1 2\nusemtl b\nf 1 2 4\nusemtl c\nf 1 3 4\n")
     scene = load(tmp_path, CAMERA + SUN + """
@@ -366,8 +309,8 @@ def test_smooth_false_makes_flat(tmp_path: Path) -> None:
 
 
 def test_include(tmp_path: Path) -> None:
-    gltf(tmp_path / "other.gltf")
-    scene = load(tmp_path, 'include = ["other.gltf"]\n' + CAMERA + """
+    gltf(tmp_path)
+    scene = load(tmp_path, 'include = ["model.glb"]\n' + CAMERA + """
 [materials.mine]
 [[spheres]]
 center = [0, 0, 0]
@@ -378,12 +321,12 @@ low = [0, 0, 0]
 high = [1, 1, 1]
 material = "mine"
 """ + SUN)
-    assert [camera.name for camera in scene.cameras] == ["main", "theirs"]
+    assert [camera.name for camera in scene.cameras] == ["main", "eye"]
     assert isinstance(scene.lights[0], DirectionalLight) and isinstance(scene.lights[1], PointLight)
     assert [len(thing.mesh.faces) for thing in scene.objects] == [12, 1]
     assert scene.spheres[0].material is scene.objects[1].materials[0]
 
-    scene = load(tmp_path, 'include = ["other.gltf"]\n[override.paint]\nkind = "mirror"\nalbedo = 0.5\n')
+    scene = load(tmp_path, 'include = ["model.glb"]\n[override.paint]\nkind = "mirror"\nalbedo = 0.5\n')
     material, = scene.objects[0].materials
     assert (material.kind, material.albedo, material.name) == ("mirror", (0.5, 0.5, 0.5), "paint")
 
@@ -413,10 +356,11 @@ MISTAKES = [
     ('[materials.m]\nalbedo_texture = { file = "scene.toml" }', "materials.m.albedo_texture"),
     ('[materials.m]\nalbedo_texture = { file = "no.png", matrix = [1, 0, 0, 0, 1, 0], scale = 2 }', "materials.m.albedo_texture"),
     ('[materials.m]\nalbedo_texture = { file = "no.png", wrap = ["clamp", "none"] }', "materials.m.albedo_texture.wrap[1]"),
+    ("ambient = 9223372036854775808", "ambient"), ("[settings]\nspp = -99999999999999999999", "settings.spp"),
     ("materials = 5", "materials"), ("spheres = 5", "spheres"), ("spheres = [5]", "spheres[0]"),
     ('[materials.m]\n[[spheres]]\nmaterial = "m"\ncenter = [0, 0, 0]\nradius = "1"', "spheres[0].radius"),
     ('[materials.m]\n[[spheres]]\nmaterial = "m"\nradius = 1', "spheres[0].center"),
-    ('[materials.m]\n[[spheres]]\nmaterial = "n"\ncenter = [0, 0, 0]\nradius = 1', "spheres[0].material"),
+    ('[materials.m]\n[[spheres]]\nmaterial = "n"\ncenter = [0, 0, 0]\nradius = 1', "spheres[0]"),
     ("[cameras.a]\nposition = [0, 0, 0]", "cameras.a"),
     ("[cameras.a]", "cameras.a"),
     ('[cameras.a]\ntype = "fishey"', "cameras.a.type"),
@@ -442,7 +386,7 @@ MISTAKES = [
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wal = "m" }', "meshes[0]"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wall = "m" }', "meshes[0]"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nparts = [{ first = 1, count = 2, material = "m" }]', "meshes[0]"),
-    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wall = "n" }\nmaterial = "m"', "meshes[0].materials.wall"),
+    ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterials = { wall = "n" }\nmaterial = "m"', "meshes[0]"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { scale = [1, 0, 1] }', "meshes[0].transform"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { axis = [1, 0, 0] }', "meshes[0].transform"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ninstances = []', "meshes[0].instances"),
@@ -464,7 +408,7 @@ def test_a_mistake_is_reported_at_its_place(tmp_path: Path, text: str, place: st
 def test_all_mistakes_are_listed_with_what_would_be_right(tmp_path: Path) -> None:
     lines = errors(tmp_path, 'titel = "x"\n[settings]\nspp = 1.5\nfilter = "gausian"\n[background]\ntype = "gradiant"\n'
                    '[materials.glass]\nkind = "glass"\nior = 0.5\n[[spheres]]\nradius = 1\ncenter = [0, 0]\nmaterial = "glas"\n')
-    for line, right in zip(sorted(lines), ("'gradient'", ">= 1", "'gaussian'", "whole number", "3 values", "'glass'", "'title'"),
+    for line, right in zip(sorted(lines), ("'gradient'", ">= 1", "'gaussian'", "whole number", "3 values", "'title'"),
                            strict=True):
         assert right in line
 
@@ -473,7 +417,7 @@ def test_all_mistakes_are_listed_with_what_would_be_right(tmp_path: Path) -> Non
     (b"a = 1\nb = [1,\n c]\n", "line 3, column 2"), (b'a = """x', "end of document"),
     (b"a = \n", "line 1, column 5"),
     (b'a = "\xff"', None), (b"a = " + b"[" * 5000 + b"]" * 5000, None),
-    (b"a = 1\na = 2\n", "line 2, column 6"),
+    (b"a = 1\na = 2\n", "line 2, column 6"), (b"a = " + b"9" * 5000, None),
 ])
 def test_files_that_are_not_toml(tmp_path: Path, data: bytes, place: str | None) -> None:
     path = tmp_path / "scene.toml"
@@ -529,37 +473,6 @@ def test_up_and_floor_are_refused_for_scene_files_and_wrong_values(tmp_path: Pat
             load_scene(tmp_path / "a.toml", **wrong)
     with refused("up", "one of x, y, z"):
         load_scene(tmp_path / "a.toml", up="w")
-
-
-def test_bare_mesh(tmp_path: Path) -> None:
-    path = tmp_path / "m.obj"
-    path.write_text(TRIANGLES + "f 1 2 3\n")
-    with pytest.warns(SceneWarning, match="no camera.*no lights"):
-        scene = load_scene(path)
-    assert len(scene.objects) == 1 and scene.cameras and scene.lights
-    assert scene.objects[0].materials[0].kind == "diffuse"
-
-
-@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
-def test_gltf_goes_to_its_reader(tmp_path: Path) -> None:
-    gltf(tmp_path / "other.gltf")
-    assert load_scene(tmp_path / "other.gltf").cameras[0].name == "theirs"
-
-
-def test_kitchen_by_ranges_of_triangles(tmp_path: Path) -> None:
-    mesh = data_path("scenes/bitterli_kitchen/kitchen_1443k.ply")
-    table = data_path("scenes/bitterli_kitchen/kitchen_parts.tsv").read_text()
-    rows = [row.split("\t") for row in table.splitlines()[1:]]
-    names = sorted({row[3] for row in rows})
-    parts = ", ".join(f'{{ first = {row[1]}, count = {row[2]}, material = "{row[3]}" }}' for row in rows)
-    scene = load(tmp_path, CAMERA + SUN + "".join(f'[materials."{name}"]\n' for name in names)
-                 + f'[[meshes]]\nfile = "{mesh}"\nparts = [{parts}]\n')
-    kitchen, = scene.objects
-    assert kitchen.face_material is not None
-    got = np.bincount(kitchen.face_material, minlength=len(kitchen.materials))
-    wanted = {name: sum(int(row[2]) for row in rows if row[3] == name) for name in names}
-    lost = [wanted[material.name] - count for material, count in zip(kitchen.materials, got, strict=True)]
-    assert sum(lost) == kitchen.mesh.dropped and min(lost) >= 0
 
 
 # --- the schema -------------------------------------------------------------------------------------------------------

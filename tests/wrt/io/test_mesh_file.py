@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-import time
+import codecs
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.data import DATA, data_path
+from tests.data import data_path
 from tests.refused import refused
 from wrt.core.errors import SceneWarning
 from wrt.io.mesh_file import load_mesh
@@ -69,31 +69,55 @@ def test_duplicate_positions_stay() -> None:
     assert len(mesh.vertices) - len(different) >= 2000
 
 
-def test_large_binary_ply_is_quick() -> None:
-    path = data_path("scenes/bitterli_kitchen/kitchen_1443k.ply")
-    begin = time.perf_counter()
-    mesh = load_mesh(path)
-    assert len(mesh.faces) + mesh.dropped == 1_443_517
-    assert time.perf_counter() - begin < 8.0  # about 0.5 s on an idle machine
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+element face 1
+property list uchar int vertex_indices
+end_header
+{} 0 0 {} 0 1
+1 0 0 0 0 1
+0 1 0 0 0 1
+3 0 1 2
+"""
+TEXTS = {  # files with a word for the first coordinate of a position, and of a normal if the format has normals
+    ".obj": "v {} 0 0\nv 1 0 0\nv 0 1 0\nvn {} 0 1 # a\nvn 0 0 1\nf 1//1 2//2 3//2\n", ".ply": PLY,
+    ".off": "OFF 3 1 0\n{} 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
+    ".stl": "solid\nfacet\nouter loop\nvertex {} 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n",
+}
 
 
-@pytest.mark.parametrize("path", sorted(p for p in DATA.glob("odd/*") if p.suffix.lower() in (".obj", ".ply", ".stl")),
-                         ids=lambda path: path.name)
-def test_odd_files_load_or_are_refused(path: Path) -> None:
-    without_faces = {"empty.obj", "empty.ply", "empty.stl", "stl_empty_bin.stl", "ply_empty_header.ply", "obj_points.obj",
-                     "obj_wireframe.obj", "ply_points_bin.ply", "points_emptyface.ply", "face_in_group_name.obj"}
-    if path.name in without_faces:
-        with refused(path=path):
+@pytest.mark.parametrize("suffix", TEXTS)
+def test_numbers_of_text(suffix: str, tmp_path: Path) -> None:
+    """Each reader knows a byte order mark and NaN and infinity as C libraries print them, and names the line of what is no number."""
+    path = tmp_path / f"a{suffix}"
+    for word, value in (("0", 0), ("-1.25D+01", -12.5), ("-.5e0", -0.5)):
+        path.write_bytes(codecs.BOM_UTF8 + TEXTS[suffix].format(word, 0).encode())
+        mesh = load_mesh(path)
+        assert mesh.vertices[0].tolist() == [value, 0, 0] and len(mesh.faces) == 1
+    for word in ("nan", "-nan(ind)", "nan(0x8000000000000)", "NaNQ", "1.#IND", "-1.#QNAN0", "1.#J", "inf", "1.#INF00e+000"):
+        path.write_text(TEXTS[suffix].format(word, 0))
+        with refused(None, "finite", path=path):
             load_mesh(path)
-        return
-    mesh = load_mesh(path)
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    assert len(mesh.faces) and (area > 0.0).all()
-    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
-    if mesh.normals is not None:
-        length = np.linalg.norm(mesh.normals, axis=1)
-        assert (np.isclose(length, 1.0, atol=1e-6) | (length == 0.0)).all()
+        if suffix in (".obj", ".ply"):
+            path.write_text(TEXTS[suffix].format(0, word))
+            with pytest.warns(SceneWarning, match="1 normals are not finite"):
+                mesh = load_mesh(path)
+            assert mesh.normals.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 1]]
+    for word in ("0,5", "x", "1.#", "1.5f", "nan(", "1..5"):
+        path.write_text(TEXTS[suffix].format(word, 0))
+        with refused(None, "is not a number", path=path, hint="decimal point" if "," in word else "") as caught:
+            load_mesh(path)
+        assert caught.value.place.startswith("line ")
+    path.write_bytes(TEXTS[suffix].format(0, 0).encode("utf-16"))
+    with refused(path=path):
+        load_mesh(path)
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".GLTF", ".toml"])

@@ -16,20 +16,22 @@ from typing import NoReturn
 import numpy as np
 
 from wrt.core.checks import short
-from wrt.core.errors import InputError, at, warn
-from wrt.core.files import read_file, utf8
-from wrt.io.mesh_file import RawMesh
+from wrt.core.errors import InputError, warn
+from wrt.core.files import read_file
+from wrt.io.mesh_file import COMMENT, RawMesh, extend
 from wrt.io.polygons import triangulate
-from wrt.io.text import as_number, without_comment
 from wrt.scene.mesh import corner_normals
 from wrt.scene.values import near_zero
 
 # Keywords of the parts of a corner `v/vt/vn`, with the count of numbers that wrt reads from a line with that keyword.
 _WIDTHS = {"v": 3, "vt": 2, "vn": 3}
-# A comment after a name. "Material #25" of 3ds Max and "#FF0000" are names.
-_NAME_COMMENT = re.compile(r"(?:^#(?!\S)|\s#(?!\d)).*", re.DOTALL)
+_NAME_COMMENT = re.compile(r"\s#(?!\w).*", re.DOTALL)  # "Material #25" of 3ds Max and "#FF0000" are names
 _GROUPS = ("usemtl", "g", "o")
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
+
+
+def _fail(line: int, message: str) -> NoReturn:
+    raise InputError(message, place=f"line {line}")
 
 
 class _Text:
@@ -49,27 +51,18 @@ class _Text:
         self.spans = {key: (array("q"), array("i")) for key in self.names}
         self.absent: dict[str, None] = {}  # vt or vn, if faces refer to it and the file has no such lines
 
-    def fail(self, line: int, message: str) -> NoReturn:
-        raise InputError(message, place=f"line {line}")
-
     def read(self, data: bytes) -> None:
         pending, number = "", 0  # pending: the lines before that end in a backslash
-        for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
+        for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", "replace"), 1):
+            line = pending + line.rstrip("\n")
             if "#" in line:
-                line = self._without_comment(pending, line)
-            if line.endswith(("\\\n", "\\")):
-                pending += line.removesuffix("\n")[:-1] + " "
-                continue
-            self._line(pending + line, number)
-            pending = ""
+                line = (_NAME_COMMENT if line.split(None, 1)[0] in self.names else COMMENT).sub(" ", line)
+            if line.endswith("\\"):
+                pending = line[:-1] + " "
+            else:
+                self._line(line, number)
+                pending = ""
         self._line(pending, number)
-
-    def _without_comment(self, pending: str, line: str) -> str:
-        """Return a line without its comment, so that a backslash at the end of the comment continues nothing."""
-        key, *rest = (pending + line).split(None, 1)
-        if key not in self.names:
-            return without_comment(line)
-        return _NAME_COMMENT.sub(" ", line) if pending.strip() else f"{key} {_NAME_COMMENT.sub(' ', rest[0])}"
 
     def _line(self, line: str, number: int) -> None:
         words = line.split()
@@ -89,14 +82,13 @@ class _Text:
         values = words[1:width + 1]
         if len(values) < width:
             if key != "vt" or not values:
-                self.fail(line, f"{key} needs {width} numbers, got {len(values)}")
+                _fail(line, f"{key} needs {width} numbers, got {len(values)}")
             values.append("0")  # a 1D texture coordinate
         self.lines[key].append(line)
         try:
-            self.numbers[key].extend(map(float, values))
-        except ValueError:  # the numbers before the first odd word were appended
-            with at(f"line {line}"):
-                self.numbers[key].extend(map(as_number, values[len(self.numbers[key]) % width:]))
+            extend(self.numbers[key], values)
+        except InputError as error:
+            raise error.at(place=f"line {line}") from None
 
     def _corners(self, corners: list[str], line: int) -> None:
         if "-" in "".join(corners):
@@ -119,11 +111,11 @@ class _Text:
                 try:
                     index = int(part)
                 except ValueError:
-                    self.fail(line, _CORNER.format(short(corner)))
+                    _fail(line, _CORNER.format(short(corner)))
                 if not count and key != "v":
                     continue  # lines may follow; if none does, `triples` leaves the index out
                 if not -count <= index < 0:
-                    self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} lines before it")
+                    _fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} lines before it")
                 parts[i] = str(count + 1 + index)
         return "/".join(parts)
 
@@ -141,14 +133,14 @@ class _Text:
         for i, corner in enumerate(self.distinct):
             for k, part in enumerate(corner.split("/")):
                 if k > 2 or (k == 0 and not part):
-                    self.fail(self._first_line(index, i), _CORNER.format(short(corner)))
+                    _fail(self._first_line(index, i), _CORNER.format(short(corner)))
                 if part and k and not self.lines[keys[k]] and part.removeprefix("-").isdecimal():
                     self.absent[keys[k]] = None
                 elif part:
                     number = int(part) if part.isdecimal() and len(part) < 19 else 0
                     triples[i, k] = number
                     if not 1 <= number <= len(self.lines[keys[k]]):
-                        self.fail(self._first_line(index, i), f"face corner {short(corner)}: {keys[k]} index {part[:30]} is not "
+                        _fail(self._first_line(index, i), f"face corner {short(corner)}: {keys[k]} index {part[:30]} is not "
                                                               f"in 1 to {len(self.lines[keys[k]])}")
         order = np.lexsort(triples.T[::-1])
         rank = np.empty(len(order), dtype=np.int32)
@@ -185,7 +177,7 @@ def read(path: Path) -> RawMesh:
     are in the group "". Vertex colours, lines, points and curves are not read. Raises InputError with the line for words that are no
     numbers, indices out of range and positions that are not finite."""
     text = _Text()
-    text.read(utf8(read_file(path)))
+    text.read(read_file(path))
     positions = text.array("v")
     corner_triples, corners = text.triples()
     text.distinct.clear()
@@ -197,7 +189,7 @@ def read(path: Path) -> RawMesh:
     bad = np.nonzero(~np.isfinite(vertices).all(axis=1))[0]
     if len(bad):
         v = int(corner_triples[bad[0], 0])
-        text.fail(text.lines["v"][v], f"position {positions[v].tolist()} is not finite ({len(bad)} in all)")
+        _fail(text.lines["v"][v], f"position {positions[v].tolist()} is not finite ({len(bad)} in all)")
 
     triangles, polygon = triangulate(corners, counts, vertices)
     vn = text.array("vn")

@@ -4,21 +4,19 @@ trimesh 5.2 is not used. It refuses binary files that mix triangles with other p
 of all quads after all first halves, and recomputes the normals of files with texture coordinates.
 """
 
+import codecs
 import io
-import re
 from array import array
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.core.files import read_file, utf8
-from wrt.io.mesh_file import RawMesh
+from wrt.core.files import read_file
+from wrt.io.mesh_file import RawMesh, extend
 from wrt.io.polygons import strip, triangulate
-from wrt.io.text import as_number
 from wrt.scene.values import near_zero
 
 _TYPES = {
@@ -30,8 +28,6 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # types of a
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-BYTES_AT_ONCE = 1 << 18  # bytes of text that are read and converted together
-_WORD = re.compile(rb"\S+")
 
 
 class _Property(NamedTuple):
@@ -58,7 +54,7 @@ def read(path: Path) -> RawMesh:
     are a vertex's u, v (or s, t, or with the prefix texture_ or texcoord_), else the `texcoord` lists of faces. A vertex becomes several
     if these lists disagree. Colours and other properties are not read. Raises InputError with the header's line, or with the
     element and row of a value that is missing, not a number, or out of range."""
-    elements = {element.name: element for element in _Source(path).elements}
+    elements = {element.name: element for element in _Source(read_file(path).removeprefix(codecs.BOM_UTF8)).elements}
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
@@ -148,130 +144,102 @@ def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.nd
     return rows[:, 0].astype(np.int64), renumbered.reshape(-1), rows[:, 1:]
 
 
-def _truncated(element: _Element, row: int) -> InputError:
-    what = f"is truncated: the header announces {element.rows} rows, but the file ends in row {row}"
-    return InputError(what, place=f"element {element.name}")
-
-
 class _Source:
     """Reader of a PLY file's header and elements."""
 
-    def __init__(self, path: Path) -> None:
-        self.data = utf8(read_file(path))
-        form, self.elements, self.at = self._header()
-        self.order = _ORDERS[form]
+    def __init__(self, data: bytes) -> None:
+        form, self.elements, self.at, lines = _header(data)
+        self.data, self.order = data, _ORDERS[form]
         if form == "ascii":  # converted to a binary file of float64, which represents every index exactly
-            self.data, self.at = self._numbers(), 0
+            self.data, self.at = _numbers(data[self.at:], lines + 1), 0
             for element in self.elements:
                 element.properties = [p._replace(type="f8", count_type=p.count_type and "f8") for p in element.properties]
         for element in self.elements:
             if element.rows and element.properties:
                 self._read(element)
 
-    def _header(self) -> tuple[str, list[_Element], int]:
-        """Return the format, the elements without their values, and the offset of the data in bytes."""
-        if not self.data.startswith(b"ply"):
-            raise InputError("is not a PLY file: it does not begin with 'ply'")
-        elements: list[_Element] = []
-        form, begin = "", 0
-        for number, line in enumerate(self.data[:1 << 20].splitlines(keepends=True), 1):
-            begin += len(line)
-            words = line.decode("latin-1").split()
-            match words:
-                case ["end_header"]:
-                    break
-                case [] | ["ply" | "comment" | "obj_info", *_]:
-                    pass
-                case ["format", name, *_] if name in _ORDERS:
-                    form = name
-                case ["element", name, rows] if rows.isdecimal() and len(rows) < 19:
-                    elements.append(_Element(name, int(rows)))
-                case ["property", "list", count, kind, name] if elements and count in _SIZES and kind in _TYPES:
-                    elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count]))
-                case ["property", kind, name] if elements and kind in _TYPES:
-                    elements[-1].properties.append(_Property(name, _TYPES[kind]))
-                case _:
-                    raise InputError(f"cannot read {line[:60].decode('latin-1').strip()!r} in the header", place=f"line {number}")
-        else:
-            raise InputError("the header has no end_header", place=f"line {number}")
-        if not form:
-            raise InputError("the header has no line `format`")
-        return form, elements, begin
-
     def _read(self, element: _Element) -> None:
-        """Read all rows of an element at once if every list is as long as in the first row (nearly always), else row by row."""
-        begin = self.at
-        sizes = [len(part) for part in self._row(element, 0)]
-        self.at = begin
-        fields: list[tuple[str, int]] = []
-        for p, size in zip(element.properties, sizes, strict=True):
-            fields += [(p.count_type, 1), (p.type, size)] if p.count_type else [(p.type, 1)]
-        table = self._table(fields, element.rows)
-        if table is None or not self._take_table(element, table, sizes):
-            self.at = begin
-            rows = [self._row(element, row) for row in range(element.rows)]
-            for i, p in enumerate(element.properties):
-                element.values[p.name] = np.concatenate([row[i] for row in rows])
-                element.counts[p.name] = np.array([len(row[i]) for row in rows], dtype=np.int64)
+        """Read the rows of an element in runs: rows whose lists have the lengths of the first of them (nearly always, that is all rows)."""
+        parts = [(p.name, list[np.ndarray](), list[np.ndarray]()) for p in element.properties]  # name, values, counts
+        row, most = 0, element.rows
+        while row < element.rows:
+            sizes = self._sizes(element, row)
+            fields: list[tuple[str, str, tuple[int, ...]]] = []
+            for i, (p, size) in enumerate(zip(element.properties, sizes, strict=True)):
+                fields += [(f"count{i}", self.order + p.count_type, ())] if p.count_type else []
+                fields.append((f"value{i}", self.order + p.type, (size,)))
+            record = np.dtype(fields)
+            rows = min(element.rows - row, most, (len(self.data) - self.at) // record.itemsize)
+            table = np.frombuffer(self.data, record, rows, self.at)
+            same = np.ones(rows, dtype=bool)
+            for i, size in enumerate(sizes):
+                if f"count{i}" in record.fields:  # type: ignore[operator]
+                    same &= table[f"count{i}"] == size
+            run = rows if same.all() else int(np.argmin(same))
+            for i, (_, values, counts) in enumerate(parts):
+                values.append(table[f"value{i}"][:run].reshape(-1))
+                counts.append(np.broadcast_to(np.int64(sizes[i]), run))
+            most = 2 * most if run == rows else 16  # in a mix of lengths, few rows are compared in vain
+            row, self.at = row + run, self.at + run * record.itemsize
+        for name, values, counts in parts:
+            element.values[name], element.counts[name] = np.concatenate(values), np.concatenate(counts)
 
-    def _take_table(self, element: _Element, table: list[np.ndarray], sizes: list[int]) -> bool:
-        """Store the columns of a table in the element. Return False if a list has another length than in `sizes`."""
-        columns = iter(table)
-        for p, size in zip(element.properties, sizes, strict=True):
-            if p.count_type and (next(columns) != size).any():
-                return False
-            element.values[p.name] = next(columns).reshape(-1)
-            element.counts[p.name] = np.broadcast_to(np.int64(size), element.rows)
-        return True
-
-    def _row(self, element: _Element, row: int) -> list[np.ndarray]:
-        """Return the values of each property in the next row."""
-        parts = []
+    def _sizes(self, element: _Element, row: int) -> list[int]:
+        """Return the number of values of each property in the row that begins at `at`."""
+        sizes, at = [], self.at
         for p in element.properties:
             size = 1
             if p.count_type:
-                count = self._take(p.count_type, 1)
-                if count is None:
-                    raise _truncated(element, row)
-                if not (0 <= count[0] < np.inf and count[0] == int(count[0])):
-                    raise InputError(f"has a list of {count[0]:g} values", place=f"{element.name} {row}")
-                size = int(count[0])
-            values = self._take(p.type, size)
-            if values is None:
-                raise _truncated(element, row)
-            parts.append(values)
-        return parts
+                kind = np.dtype(self.order + p.count_type)
+                count = np.frombuffer(self.data[at:at + kind.itemsize].ljust(kind.itemsize, b"\0"), kind)[0]
+                if not (0 <= count < np.inf and count == int(count)):
+                    raise InputError(f"has a list of {count:g} values", place=f"{element.name} {row}")
+                size, at = int(count), at + kind.itemsize
+            sizes.append(size)
+            at += size * np.dtype(p.type).itemsize
+        if at > len(self.data):
+            what = f"is truncated: the header announces {element.rows} rows, but the file ends in row {row}"
+            raise InputError(what, place=f"element {element.name}")
+        return sizes
 
-    def _take(self, kind: str, count: int) -> np.ndarray | None:
-        """Return the next `count` values of a type, or None if the file ends before."""
-        dtype = np.dtype(self.order + kind)
-        if self.at + count * dtype.itemsize > len(self.data):
-            return None
-        self.at += count * dtype.itemsize
-        return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
 
-    def _table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        """Return an array (rows, n) for each field (type, n) of the next `rows` records, or None if the file ends before."""
-        record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
-        if self.at + rows * record.itemsize > len(self.data):
-            return None
-        table = np.frombuffer(self.data, record, rows, self.at) if record.itemsize else np.zeros(rows, record)
-        self.at += rows * record.itemsize
-        return [table[f"f{i}"] for i in range(len(fields))]
+def _header(data: bytes) -> tuple[str, list[_Element], int, int]:
+    """Return the format, the elements without their values, the offset of the data in bytes, and the number of lines before it."""
+    if not data.startswith(b"ply"):
+        raise InputError("is not a PLY file: it does not begin with 'ply'")
+    elements: list[_Element] = []
+    form, begin = "", 0
+    for number, line in enumerate(data[:1 << 20].splitlines(keepends=True), 1):
+        begin += len(line)
+        words = line.decode("latin-1").split()
+        match words:
+            case ["end_header"]:
+                break
+            case [] | ["ply" | "comment" | "obj_info", *_]:
+                pass
+            case ["format", name, *_] if name in _ORDERS:
+                form = name
+            case ["element", name, rows] if rows.isdecimal() and len(rows) < 19:
+                elements.append(_Element(name, int(rows)))
+            case ["property", "list", count, kind, name] if elements and count in _SIZES and kind in _TYPES:
+                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count]))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].properties.append(_Property(name, _TYPES[kind]))
+            case _:
+                raise InputError(f"cannot read {line[:60].decode('latin-1').strip()!r} in the header", place=f"line {number}")
+    else:
+        raise InputError("the header has no end_header", place=f"line {number}")
+    if not form:
+        raise InputError("the header has no line `format`")
+    return form, elements, begin, number
 
-    def _numbers(self) -> bytes:
-        """Return the words of a text file as the bytes of float64 numbers."""
-        numbers, stream = array("d"), io.BytesIO(self.data)
-        stream.seek(self.at)
-        while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
-            before, words = len(numbers), text.split()
-            try:
-                try:
-                    numbers.extend(map(float, words))
-                except ValueError:  # the numbers before the first odd word were appended
-                    numbers.extend(map(as_number, words[len(numbers) - before:]))
-            except InputError as error:
-                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))
-                line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
-                raise error.at(place=f"line {line}") from None
-        return numbers.tobytes()
+
+def _numbers(text: bytes, first: int) -> bytes:
+    """Return the words of a text as the bytes of float64 numbers. first: the number of its first line in the file."""
+    numbers = array("d")
+    for line, words in enumerate(io.BytesIO(text), first):
+        try:
+            extend(numbers, words.split())
+        except InputError as error:
+            raise error.at(place=f"line {line}") from None
+    return numbers.tobytes()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,8 @@ LIMITS = {"minimum": (">=", operator.lt), "exclusiveMinimum": (">", operator.le)
 
 def check(data: JsonObject, path: Path) -> JsonObject:
     """Return the tables of a scene file unchanged. Raises one InputError that lists all mistakes."""
-    schema, materials = scene_schema(), data.get("materials")
-    known = materials if isinstance(materials, dict) else {}
-    raise_all([*mistakes(data, schema, "", schema["$defs"]), *([] if data.get("include") else unknown_materials(data, known))], path)
+    schema = scene_schema()
+    raise_all(list(mistakes(data, schema, "", schema["$defs"])), path)
     return data
 
 
@@ -79,6 +78,8 @@ def mistakes(value: Any, schema: Schema, place: str, tables: Mapping[str, Table]
             yield unknown(value, "value", schema["enum"], place=place)
     elif isinstance(value, float) and not math.isfinite(value):
         yield _wrong(value, "a finite number", place)
+    elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+        yield _wrong(value, "a number of at most 64 bits", place)
     elif not isinstance(value, bool):
         yield from (_wrong(value, f"a number {LIMITS[name][0]} {schema[name]:.15g}", place)
                     for name in LIMITS if name in schema and _beyond(value, name, schema[name]))
@@ -108,25 +109,6 @@ def _in_one_of(value: JsonObject, schema: Schema, place: str, tables: Mapping[st
         yield unknown(kind if isinstance(kind, str) else short(kind), key, names, place=_join(place, key))
     else:
         yield from mistakes(value, {"$ref": names[kind]}, place, tables)
-
-
-def unknown_materials(data: JsonObject, known: Collection[str]) -> list[InputError]:
-    """Return an error for each reference to an unknown material. `mistakes` reports values of a wrong type."""
-    found: list[tuple[str, Any]] = []
-    for kind in ("spheres", "quads", "boxes", "meshes"):
-        for i, table in enumerate(_tables(data.get(kind))):
-            at = f"{kind}[{i}]"
-            found.append((f"{at}.material", table.get("material")))
-            groups = table.get("materials")
-            if isinstance(groups, dict):
-                found += [(f"{at}.materials.{group}", name) for group, name in groups.items()]
-            found += [(f"{at}.parts[{j}].material", part.get("material"))
-                      for j, part in enumerate(_tables(table.get("parts")))]
-    return [unknown(name, "material", known, place=place) for place, name in found if isinstance(name, str) and name not in known]
-
-
-def _tables(value: Any) -> list[JsonObject]:
-    return [table if isinstance(table, dict) else {} for table in value] if isinstance(value, list) else []
 
 
 def _type(schema: Schema) -> str:

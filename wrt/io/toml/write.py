@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,11 +13,11 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
-from wrt.core.files import check_writable, write_bytes
+from wrt.core.files import check_writable, checksum_of, write_bytes
 from wrt.core.packages import needed_by
 from wrt.picture.image import write_image
 from wrt.scene.backgrounds import BACKGROUNDS
-from wrt.scene.cameras import CAMERAS, CameraKind
+from wrt.scene.cameras import CAMERAS
 from wrt.scene.kinds import forms
 from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import Checkerboard, Material, Texture
@@ -82,14 +81,11 @@ class _Writer:
     def described(self, thing: Any, known: Mapping[str, type] | None = None) -> Table:
         """Return the described fields of a camera, light, background or settings. known: the registered classes."""
         kind = type(thing)
-        at = at_thing(getattr(thing, "what", "camera" if isinstance(thing, CameraKind) else kind.__name__.lower()),
-                      getattr(thing, "name", ""))
-        if known is not None and known.get(thing.kind) is not kind:
-            raise InputError(f"a scene file does not hold a {kind.__name__}: the class is not registered", place=at[:-2])
-        missing = {each.name for each in fields(kind)} - forms(kind).keys() - {"name", "camera_to_world"}
-        if missing:
-            raise InputError(f"a scene file does not hold the fields {', '.join(sorted(missing))} of a {kind.__name__}, which have no"
-                             " description", place=at[:-2])
+        described = {"name", "camera_to_world", *forms(kind)}
+        if known is not None and (known.get(thing.kind) is not kind or any(each.name not in described for each in fields(kind))):
+            at = at_thing(getattr(thing, "what", "camera"), getattr(thing, "name", ""))
+            raise InputError(f"a scene file does not hold a {kind.__name__}: the class is not registered, or a field has no description",
+                             place=at[:-2])
         out: Table = {}
         for name, each in forms(kind).items():
             value, form = getattr(thing, name), each.metadata["form"]
@@ -103,11 +99,7 @@ class _Writer:
         """Add the file of a thing that has these arrays, and return its name for the scene file. A shared thing is one file."""
         key = id(thing)
         if key not in self._names:
-            digest = blake2b(digest_size=8)
-            for array in arrays:
-                digest.update(repr(array is None or (array.shape, array.dtype)).encode())
-                digest.update(b"" if array is None else array.tobytes())
-            name = f"{stem}{len(self.files)}-{digest.hexdigest()}{suffix}"
+            name = f"{stem}{len(self.files)}-{checksum_of(*(np.zeros(0) if array is None else array for array in arrays)):08x}{suffix}"
             self.files[name], self._names[key] = write, f"{self.folder}/{name}"
         return self._names[key]
 

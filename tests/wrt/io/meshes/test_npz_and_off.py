@@ -33,32 +33,21 @@ def test_off(tmp_path: Path) -> None:
     mesh = wrt.load_mesh(tmp_path / "a.off")
     assert len(mesh.vertices) == 5 and mesh.faces[2:].tolist() == [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
     assert wrt.contains(wrt.build(tmp_path / "a.off"), [[0.5, 0.5, 0.5], [0.5, 0.5, 1.5]]).tolist() == [True, False]
-    for old, new, what, place in (("COFF", "ply", "no OFF file", None), ("COFF 5 5", "OFF 5 2000000000", "ends too early", None),
-                                  ("3 0 1 4", "3 0 1 5", "none of the 5 vertices", "line 10"), ("3 3 0 4\n", "", "a face is missing", None),
-                                  ("3 0 1 4", "3 0 1", "needs 3 corners", "line 10"), ("0.5 0.5 1 ", "0.5 nan 1 ", "finite", "line 8"),
-                                  ("0.5 0.5 1 ", "0.5 x 1 ", "numbers", "line 8"), ("4 3 2", "-4 3 2", "corners", "line 9")):
+    for old, new, what, place in (
+            ("COFF", "ply", "no OFF file", None), ("COFF 5 5 0", "4OFF 5 5 0", "no OFF file", None),
+            ("COFF 5 5 0", "OFF BINARY", "no OFF file", None), ("COFF 5 5", "OFF 5 2000000000", "ends too early", None),
+            ("3 3 0 4\n", "", "ends too early", None),
+            ("3 0 1 4", "3 0 1 5", "none of the 5 vertices", "line 10"), ("3 0 1 4", "3 0 1", "needs 4 numbers", "line 10"),
+            ("0.5 0.5 1 ", "0.5 nan 1 ", "finite", "line 8"), ("0.5 0.5 1 ", "0.5 x 1 ", "number", "line 8"),
+            ("4 3 2", "-4 3 2", "'-4'", "line 9")):
         (tmp_path / "b.off").write_text(PYRAMID.replace(old, new))
         with refused(None, what, place, path="b.off"):
             wrt.load_mesh(tmp_path / "b.off")
-
-
-@pytest.mark.parametrize(("old", "new"), [
-    ("COFF 5 5 0", "COFF5 5 0"), ("COFF 5 5 0", "OFF5 5 0"), ("COFF 5 5 0", "STCNOFF5 5"),
-    ("COFF 5 5 0", "CSTOFF 5 5 0"), ("COFF 5 5 0", "NCSTOFF 5 5 0"), ("COFF 5 5 0", "off\n# counts\n5 5 0 # of all"),
-    ("COFF 5 5 0", "5 5 0"), ("COFF", "COFF# 3 1 0\n"), ("0.5 0.5 1 ", "5.0D-01 5d-1 1D0 1.#IND "), ("\n", "\r\n"),
-])
-def test_variants_of_off(old: str, new: str, tmp_path: Path) -> None:
-    for name, text in (("a.off", PYRAMID), ("b.off", PYRAMID.replace(old, new))):
-        (tmp_path / name).write_bytes(text.encode())
-    plain, other = (wrt.load_mesh(tmp_path / name) for name in ("a.off", "b.off"))
-    assert plain.vertices.tolist() == other.vertices.tolist() and plain.faces.tolist() == other.faces.tolist()
-
-
-@pytest.mark.parametrize("first", ["nOFF 3\n5 5 0", "4OFF 5 5 0", "OFF BINARY", "OFFX 5 5 0", "OFF-5 5 0", "x"])
-def test_other_keywords_are_refused(first: str, tmp_path: Path) -> None:
-    (tmp_path / "a.off").write_text(PYRAMID.replace("COFF 5 5 0", first))
-    with refused(None, "no OFF file", path="a.off"):
-        wrt.load_mesh(tmp_path / "a.off")
+    for old, new in (("COFF 5 5 0", "COFF5 5 0"), ("COFF 5 5 0", "STCNOFF5 5"), ("COFF 5 5 0", "off\n# counts\n5 5 0 # of all"),
+                     ("COFF 5 5 0", "5 5 0"), ("\n", "\r\n")):
+        (tmp_path / "b.off").write_bytes(PYRAMID.replace(old, new).encode())
+        other = wrt.load_mesh(tmp_path / "b.off")
+        assert mesh.vertices.tolist() == other.vertices.tolist() and mesh.faces.tolist() == other.faces.tolist()
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".ply", ".stl", ".off", ".obj", ".OBJ"])
@@ -94,7 +83,8 @@ def test_other_readers_find_the_saved_bits(suffix: str, tmp_path: Path) -> None:
 
 def test_what_npz_refuses(tmp_path: Path) -> None:
     good = {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]])}
-    for change, what in (({"faces": np.array([[0, 1, 3]])}, "3 vertices"), ({"faces": np.eye(3)}, "integers"),
+    for change, what in (({"faces": np.array([[0, 1, 3]])}, "3 vertices"), ({"groups": np.eye(2)}, "str"),
+                         ({"faces": np.eye(3)}, "integers"),
                          ({"normals": np.eye(3)[:2]}, "3 rows"), ({"vertices": np.eye(3) * np.nan}, "finite"),
                          ({"uvs": np.eye(3)}, "(N, 2)"), ({"vertices": np.array([None])}, "")):
         np.savez(tmp_path / "a.npz", **(good | change))
