@@ -4,6 +4,8 @@ document this. The self-test of wrt.accel.queries.raw_launches checks it."""
 
 import warp as wp
 
+from wrt.kernels.structs import kernel
+
 
 @wp.struct
 class Launch:
@@ -50,3 +52,26 @@ def run_range(launch: Launch, first: int, end: int):
     """Run the kernel for rays first .. end - 1; `first` and `end` are its last two arguments."""
     set_range(launch, first, end)
     run(launch)
+
+
+# --- the self-test's kernel, which shows that a kernel can launch another one ------------------------------------------
+
+PER_THREAD = wp.constant(2)  # number of words that one thread writes
+
+
+@wp.struct
+class Canary:
+    """The words that the kernel writes. They lie inside a larger array, in which the self-test finds stray writes."""
+
+    words: wp.array(dtype=int)
+
+
+@kernel
+def probe(canary: Canary, values: wp.array(dtype=float), launch: Launch, first: int, end: int):
+    """Write values[i] + end to words[i] for first <= i < end. If `launch` is set, run that launch for this range instead."""
+    if launch.entry != wp.uint64(0):
+        run_range(launch, first, end)
+        return
+    begin = first + PER_THREAD * wp.tid()  # a surplus thread would write behind the range, where the self-test looks
+    for i in range(begin, begin + PER_THREAD):
+        canary.words[i] = int(values[i]) + end

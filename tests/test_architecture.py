@@ -59,7 +59,7 @@ IN_WRT = {
 }
 # For each folder of wrt/, the parts of kernels/ that it may import; folders that are not listed import none.
 KERNELS_OF_HOST = {
-    "accel": {"launch_probe", "launches", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide",
+    "accel": {"launches", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide",
               "units", "warp_private", "structs"},
     "compat": {"placed_rays", "query"},
     "renderer": {"parameters", "launches", "query", "loops", "shade", "traverse", "wide", "warp_private", "structs"},
@@ -71,8 +71,7 @@ NAME_THE_LABORATORY = ("wrt/lab/", "kernels/study/", "wrt/cli/", "wrt/testing.py
 # For each module and folder of kernels/, the others that it may import.
 BELOW_KERNELS = {
     "headers": set(),
-    "launches": set(),
-    "launch_probe": {"launches", "structs"},
+    "launches": {"structs"},
     "parameters": set(),
     "structs": {"headers", "parameters"},
     "warp_private": set(),

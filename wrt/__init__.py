@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wrt.core.version import VERSION as __version__
+from wrt.core.settings import VERSION as __version__
 
 if not Path(__file__).is_file():
     raise ImportError("wrt cannot be imported from a zip file, because it reads files beside its code: unpack or install it")
@@ -89,14 +89,6 @@ def _public() -> dict[str, str]:
 
 
 _HOME = _public()
-# What users of other libraries look for, and where it is.
-_CLOSEST, _ANY = (f"wrt.build(mesh).{name}(origins, directions)" for name in ("closest_hit", "any_hit"))
-ELSEWHERE = {"closest_hit": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)", "Trimesh": "wrt.Mesh",
-             "shapes": "wrt.scene.shapes", "read_triangle_mesh": "wrt.load_mesh", "load_obj": "wrt.load_mesh",
-             "RaycastingScene": "wrt.compat.open3d.RaycastingScene", "RayMeshIntersector": "wrt.compat.trimesh.RayMeshIntersector",
-             "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
-             "look_at": "wrt.Camera.look_at", "load": "wrt.load_mesh, or wrt.load_scene",
-             "set_variant": "device= of wrt.build and wrt.render", "Ray": "arrays of origins and directions (docs/usage.md)"}
 _MODULES = [name for name, module in _HOME.items() if module == __name__]
 __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
@@ -125,20 +117,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         value = globals()[name] = getattr(importlib.import_module(_HOME[name]), name)
         return value
-    hint = "" if name.startswith("_") else _hint(name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; ' + hint}")
-
-
-def _hint(name: str) -> str:
-    """Return where an unknown name is, or the most similar public name; "" without either."""
-    from wrt.core.checks import did_you_mean
-
-    if name in ELSEWHERE:
-        return f"use {ELSEWHERE[name]}"
-    for place in ("wrt.sensors", "wrt.scene.shapes"):
-        if callable(getattr(importlib.import_module(place), name, None)):
-            return f"use {place}.{name}"
-    return did_you_mean(name, __dir__()).rstrip()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:

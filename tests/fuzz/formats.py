@@ -22,8 +22,8 @@ from tests.fuzz import seeds
 from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
-from wrt.core.checked_file import CHECKSUM_BYTES
 from wrt.core.errors import InputError
+from wrt.core.files import CHECKSUM_BYTES
 
 
 @dataclass(frozen=True)

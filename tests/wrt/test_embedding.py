@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -71,38 +70,6 @@ def test_settings_of_warp_are_for_kernels_of_the_user(decorator: Any, monkeypatc
     assert "-ffast-math" in options.pop("cpu_compiler_flags") and SETTINGS.items() - options.items() == {
         ("cpu_compiler_flags", SETTINGS["cpu_compiler_flags"])}
     assert fit_kdops.module.resolve_options(wp.config) == before
-
-
-@pytest.mark.parametrize("kib", [64, 512])
-@pytest.mark.parametrize("where", ["there", "here"])
-def test_small_stacks_of_threads_are_not_for_kernels(kib: int, where: str, expected: str) -> None:
-    call = "thread = threading.Thread(target=work); thread.start(); thread.join()" if where == "there" else "work()"
-    assert printed(f"threading.stack_size({kib} << 10); {call}; print(threading.stack_size() >> 10)") == [expected, str(kib)]
-
-
-@pytest.mark.parametrize("name", ["bvh2_kdop", "kdtree"])
-def test_a_thread_with_a_small_stack_builds_and_asks(name: str, expected: str) -> None:
-    code = "threading.stack_size(64 << 10); thread = threading.Thread(target=work); thread.start(); thread.join()"
-    assert printed(code, name) == [expected]
-
-
-@pytest.mark.slow
-def test_kernels_are_compiled_for_threads_with_small_stacks(tmp_path: Path, expected: str) -> None:
-    code = f"""if True:
-        import warp as wp
-        wp.config.kernel_cache_dir = {str(tmp_path)!r}
-        threading.stack_size(64 << 10)
-        thread = threading.Thread(target=work)
-        thread.start()
-        thread.join()
-    """
-    assert printed(code) == [expected]
-
-
-def test_a_small_stack_of_the_main_thread(expected: str) -> None:
-    done = subprocess.run(["sh", "-c", f"ulimit -s 256; exec {sys.executable} -c \"$CODE\""], check=True, capture_output=True,
-                          text=True, timeout=600, cwd=ROOT, env={**os.environ, "CODE": f"NAME = 'bvh'\n{WORK}\nwork()"})
-    assert done.stdout.splitlines() == [expected]
 
 
 @pytest.mark.parametrize("threads", [1, 2])

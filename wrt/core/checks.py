@@ -4,14 +4,11 @@ import difflib
 import operator
 import os
 import re
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import fields
-from functools import wraps
-from inspect import Parameter, signature
+from collections.abc import Collection, Iterable
 from itertools import islice
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import TypeVar, Union, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -126,32 +123,6 @@ def most_similar(name: str, known: Iterable[str]) -> str:
     """Return the known name that is most similar to `name`; "" if none is similar."""
     names = [each for each in islice(known, 1000) if len(each) <= 100]
     return next(iter(difflib.get_close_matches(name[:100], names, n=1)), "")
-
-
-def parameters_of(function: Callable[..., object], *more: str) -> list[str]:
-    """Return the names of the keywords of a function: its parameters, with `more` in place of `**`."""
-    return [*more, *(name for name, each in signature(function).parameters.items() if each.kind is not Parameter.VAR_KEYWORD)]
-
-
-def check_keywords(function: str, keywords: Iterable[str], known: Collection[str]) -> None:
-    """Raise TypeError for a keyword that a function does not know, with the known one that is most similar."""
-    for name in keywords:
-        if name not in known:
-            near = did_you_mean(name, known).rstrip()
-            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}{near and '; ' + near}")
-
-
-def suggest_fields(cls: type[T]) -> type[T]:
-    """Let a dataclass answer an unknown keyword with the field that is most similar, as `check_keywords` does."""
-    known, init = [each.name for each in fields(cls)], cls.__init__  # type: ignore[arg-type]
-
-    @wraps(init)
-    def __init__(self: T, *args: Any, **keywords: Any) -> None:
-        check_keywords(cls.__name__, keywords, known)
-        init(self, *args, **keywords)
-
-    cls.__init__ = __init__  # type: ignore[method-assign, assignment]
-    return cls
 
 
 def at_thing(kind: str, name: str) -> str:

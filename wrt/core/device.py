@@ -1,13 +1,12 @@
 """Start of Warp, loading and launching of kernels, and copies of arrays to and from a device."""
 
-import contextlib
 import os
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, partial, wraps
 from math import prod
 from pathlib import Path
@@ -20,9 +19,9 @@ import warp as wp
 
 from wrt.core import settings, warp_private
 from wrt.core.building import loading
-from wrt.core.compiling import WATCH, is_intact, remove
+from wrt.core.compiling import WATCH
 from wrt.core.errors import InputError, warn
-from wrt.core.threads import run_all, submit, thread_count, with_stack
+from wrt.core.threads import run_all, submit, thread_count
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
 
 MOST_ROWS = (1 << 31) - 1
@@ -140,9 +139,12 @@ def load_kernel(kernel: Kernel, device: Device) -> None:
     Raises InputError if the cache's folder is full or cannot be written to."""
     loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
     if place not in loaded.devices:
-        with loading(), loaded.lock:
+        with loading(), loaded.lock, _cache_errors():
             if place not in loaded.devices:
-                with_stack(partial(_load, kernel, device, place[1]))
+                is_cached = all(path.is_file() for path in warp_private.cache_files(kernel, device, place[1]))
+                Path(wp.config.kernel_cache_dir).mkdir(parents=True, exist_ok=True)
+                with nullcontext() if is_cached else WATCH.compiling():
+                    warp_private.load(kernel, device, place[1])
                 loaded.devices.add(place)
 
 
@@ -171,23 +173,6 @@ def preload_headers(kernel: Kernel) -> None:
         submit(partial(load_kernel, kernel, cpu))
 
 
-def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
-    """Load a kernel; compile it again if its files in the cache are damaged."""
-    with _cache_errors():
-        files = warp_private.cache_files(kernel, device, block_dim)
-        folder, sealed = files[0].parent, warp_private.is_own(kernel)
-        before = [path for path in (files if folder.is_dir() else [folder]) if os.path.lexists(path)]
-        with contextlib.suppress(Exception):  # raised below, if it happens again
-            if all(is_intact(path, sealed) for path in files):
-                warp_private.load(kernel, device, block_dim)
-                return
-        for path in before:  # files that another process has compiled since stay
-            remove(path)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with WATCH.compiling():
-            warp_private.load(kernel, device, block_dim)
-
-
 @contextmanager
 def _cache_errors() -> Iterator[None]:
     """Turn errors of the system and of Warp about the kernel cache into an InputError with a hint."""
@@ -196,8 +181,8 @@ def _cache_errors() -> Iterator[None]:
     except Exception as error:
         if not isinstance(error, OSError | UnicodeError) and not warp_private.is_warps_error(error):
             raise
-        reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
-        raise InputError(f"kernels cannot be compiled: {reason}", hint="set WARP_CACHE_PATH to another folder",
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"kernels cannot be compiled: {why}", hint="set WARP_CACHE_PATH to another folder",
                          path=wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
 
 

@@ -2,6 +2,7 @@
 
 import os
 
+VERSION = "0.1.0"  # of wrt: pyproject.toml reads it here
 DEFAULT_DEVICE = os.environ.get("WRT_DEVICE") or "cpu"  # of all functions and commands
 BLOCK_DIMS = (64, 32, 128, 256)
 STACKS = ("local", "shared")  # memory of traversal stacks: the names of kernels.traverse.stack.PLACES

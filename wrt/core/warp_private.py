@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from wrt.core.compiling import seal, shared_headers
+from wrt.core.compiling import shared_headers
 from wrt.core.errors import InputError
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 
@@ -36,7 +36,8 @@ try:
     from warp._src import build, codegen, context
     from warp._src.types import array_t
 
-    _resolve_options = context.Module.resolve_options
+    _resolve_options, _live_kernels = context.Module.resolve_options, context.Module._get_live_kernels
+    _NOT_GUARANTEED = wp.config.DeterministicMode.NOT_GUARANTEED
 except (ImportError, AttributeError) as error:
     raise refusal(str(error)) from error
 
@@ -164,8 +165,6 @@ def refuse_capture(device: Device | None = None) -> None:
 # --- kernels and their files ------------------------------------------------------------------------------------------
 
 IN_CACHE = "wp_*"  # folders of modules in the kernel cache
-# Folders that killed processes leave in the cache: unfinished compilations; precompiled headers of wrt or of older versions of Warp.
-LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
 NO_DRIVER = "NVIDIA CUDA driver"  # in the line that Warp's C++ code writes to file descriptor 2 at each start without a GPU
 
 
@@ -211,14 +210,14 @@ def is_warps_error(error: BaseException) -> bool:
 # Settings that change bits or print lines, with Warp's defaults: modules of wrt are compiled with these, whatever wp.config has.
 _CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "verify_autograd_array_access": False, "llvm_cuda": False,
            "enable_vector_component_overwrites": False, "default_grid_stride": True}
-_OPTIONS = {"max_unroll": 16, "deterministic": wp.config.DeterministicMode.NOT_GUARANTEED, "deterministic_max_records": 0}
+_OPTIONS = {"max_unroll": 16, "deterministic": _NOT_GUARANTEED, "deterministic_max_records": 0}
 _FLAGS = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
 # Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
 _KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
 
 
 def _is_own_module(module: Any) -> bool:
-    kernels = module._get_live_kernels()
+    kernels = _live_kernels(module)
     return len(kernels) > 0 and all(map(is_own, kernels))
 
 
@@ -303,11 +302,11 @@ def _drop_unused_helpers() -> None:
 
 
 def _compile_well() -> None:
-    """Share precompiled headers between all threads and processes (saves 6.4 s), and seal each object.
+    """Share precompiled headers between all threads and processes (saves 6.4 s).
 
     Warp 1.19 precompiles its headers in every thread that compiles. With FLAGS, the templates of the headers are compiled once, not with
     each kernel, and values have no names (0.4 of the 6.4 s). A kernel whose source begins with `#define WP_NO_BFLOAT16` gets headers
-    without bfloat16 (0.4 s). LLVM crashes on a damaged object, or runs it; the seal reveals the damage."""
+    without bfloat16 (0.4 s)."""
     compile_object, own_headers = build.build_cpu, context.runtime.get_clang_pch_dir
 
     @wraps(compile_object)
@@ -325,11 +324,10 @@ def _compile_well() -> None:
                 compile_object(str(folder / "empty.o"), str(folder / "empty.cpp"), **{**options, "pch_dir": str(folder)})
 
             try:
-                options["pch_dir"] = str(shared_headers(Path(wp.config.kernel_cache_dir), _headers_key(options), precompile, LEFTOVER))
+                options["pch_dir"] = str(shared_headers(Path(wp.config.kernel_cache_dir), _headers_key(options), precompile))
             except OSError:  # the cache is read-only, and the kernel is compiled in another folder
                 options["pch_dir"] = own_headers()
         compile_object(obj_path, cpp_path, **options)
-        seal(Path(obj_path))
 
     build.build_cpu = build_cpu
     context.runtime.get_clang_pch_dir = lambda: None if _own() else own_headers()  # it makes a folder in each thread

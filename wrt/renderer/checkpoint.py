@@ -1,6 +1,6 @@
 """Checkpoints of long renders: the film in a file, which is replaced as a whole, so that it is never incomplete (wrt.core.files).
 
-A checkpoint is a file with checksums (wrt.core.checked_file). It contains the identity of its render (everything that can change a
+A checkpoint is a file with checksums (wrt.core.files). It contains the identity of its render (everything that can change a
 pixel), the progress, and the film's arrays. A render can resume from any state between two tiles.
 """
 
@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.errors import InputError
-from wrt.core.files import check_writable, replacing
-from wrt.core.version import VERSION
+from wrt.core.files import check_writable, read_checked, replacing, write_checked
+from wrt.core.settings import VERSION
 from wrt.renderer.film import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan

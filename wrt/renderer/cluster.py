@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from wrt.core.errors import InputError
-from wrt.core.version import VERSION
+from wrt.core.settings import VERSION
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -8,16 +8,15 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from wrt.core.interrupts import held_interrupts
-from wrt.core.threads import submit, with_stack
+from wrt.core.settings import VERSION
+from wrt.core.threads import submit
 from wrt.core.types import Device
-from wrt.core.version import VERSION
 from wrt.picture.film import Film
 from wrt.picture.tonemap import auto_exposure
 from wrt.renderer.film import VISIBLE, AovFilm, DeviceFilm, Rectangle, Work, needed_depth
@@ -74,7 +73,7 @@ class LocalTracer:
         if min(self.prepared.threads, len(work)) == 1:  # the calling thread: another thread would cost 5 % of a small picture
             done, next_step = 0, time.monotonic() + STEP_SECONDS
             for job in work:
-                done += with_stack(partial(trace, job))
+                done += trace(job)
                 if time.monotonic() >= next_step or due():
                     yield done, True
                     next_step = time.monotonic() + STEP_SECONDS

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypedDict, Unpack
 
 import numpy as np
 
-from wrt.core.checks import at_thing, suggest_fields
+from wrt.core.checks import at_thing
 from wrt.core.errors import InputError, wrong
 from wrt.core.types import ArrayLike
 from wrt.scene.kinds import Record, check_fields, forms, given
@@ -115,7 +115,6 @@ class CameraFields(TypedDict, total=False):
     name: str
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Camera(CameraKind):
     """A pinhole camera, or a thin lens if the aperture is larger than 0.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wrt.core.checks import at_thing, suggest_fields
+from wrt.core.checks import at_thing
 from wrt.core.errors import wrong
 from wrt.scene.kinds import Kind, Record, given
 from wrt.scene.values import ROUNDING, Color, as_number
@@ -19,7 +19,6 @@ class Light(Kind):
     what = "light"
 
 
-@suggest_fields
 @dataclass(frozen=True)
 class PointLight(Light):
     """A point that emits equally in all directions: irradiance = intensity / distance^2."""
@@ -33,7 +32,6 @@ class PointLight(Light):
         return {"position": self.position, "color": self.intensity}
 
 
-@suggest_fields
 @dataclass(frozen=True)
 class DirectionalLight(Light):
     """Parallel light from infinity."""
@@ -47,7 +45,6 @@ class DirectionalLight(Light):
         return {"direction": self.direction, "color": self.irradiance}
 
 
-@suggest_fields
 @dataclass(frozen=True)
 class SpotLight(Light):
     """A point light limited to a cone.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_choice, at_thing, suggest_fields
+from wrt.core.checks import LARGEST, as_array, as_choice, at_thing
 from wrt.core.errors import wrong
 from wrt.scene.kinds import check_fields, forms, given
 from wrt.scene.values import BLACK, Color
@@ -15,7 +15,6 @@ from wrt.scene.values import BLACK, Color
 WRAPS = ("repeat", "clamp", "mirror")
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Texture:
     """An 8-bit image, sampled bilinearly.
@@ -103,7 +102,6 @@ CONDUCTORS: dict[str, tuple[Color, Color]] = {
 }
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Material:
     """Optical properties of a surface. Objects share a material if they hold the same instance; equality is identity.

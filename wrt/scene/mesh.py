@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown, suggest_fields
+from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
 from wrt.core.errors import InputError
 from wrt.core.files import checksum_of, write_bytes
 from wrt.core.packages import needed_by
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import trimesh
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh in object space.

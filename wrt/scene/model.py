@@ -17,7 +17,7 @@ from typing import Any, Self, Unpack
 
 import numpy as np
 
-from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, suggest_fields, unknown
+from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, unknown
 from wrt.core.errors import InputError, wrong
 from wrt.core.registry import Registry
 from wrt.core.types import PathLike
@@ -34,7 +34,6 @@ GREY = Material()
 MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` replaces repeated meshes by their boxes
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Object:
     """A mesh placed in the world.
@@ -94,7 +93,6 @@ class Object:
         return self.transform if self.mesh.origin is None else self.transform @ shift(self.mesh.origin)
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Sphere:
     """An exact sphere in world space. u runs around +y from -x (0 to 1), v from the top (0) to the bottom (1)."""
@@ -111,7 +109,6 @@ class Sphere:
         object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=SMALLEST, high=MAX_REACH))
 
 
-@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that a render needs. A frozen dataclass: `dataclasses.replace` makes changed copies.

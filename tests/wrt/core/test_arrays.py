@@ -78,11 +78,6 @@ def test_a_film_is_its_pixels_everywhere(film: Film) -> None:
     assert address(tensor) == here and tensor.shape == (4, 6, 3)
 
 
-def test_a_film_that_another_made_of_a_strided_picture(film: Film) -> None:
-    flipped = Film(film.pixels[::-1], film.variance, film.samples)
-    assert np.array_equal(np.asarray(flipped), film.pixels[::-1]) and np.array_equal(flipped.warp().numpy(), film.pixels[::-1])
-
-
 def test_hits_go_to_numpy_and_warp_and_back() -> None:
     hits = wrt.build(box()).closest_hit(ORIGINS, DIRECTIONS)
     for name in ("t", "u", "v", "prim_id"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from tests.data import ROOT
 from tests.refused import refused
 from wrt.accel.instances import Instances
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.building import build_clock, loading
 from wrt.scene.shapes import icosphere, torus
 
 SCENE = ROOT / "scenes" / "conductor.toml"
@@ -63,40 +61,3 @@ def test_what_cannot_be_called_is_refused_and_an_error_ends_the_build() -> None:
         wrt.build(icosphere(1), progress="bar")  # type: ignore[call-overload]
     with pytest.raises(KeyboardInterrupt):
         wrt.build(icosphere(1), progress=lambda done: (_ for _ in ()).throw(KeyboardInterrupt))
-
-
-@pytest.mark.parametrize("accel", ["bvh", "octree"])
-def test_after_an_error_in_the_function_later_builds_do_not_call_it(accel: str) -> None:
-    calls = 0
-
-    def stop(done: float) -> None:
-        nonlocal calls
-        calls += 1
-        if done > 0.0:
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError) as kept:  # keeps the frames of the build alive
-        wrt.build([icosphere(1), icosphere(2)], accel, progress=stop)
-    before = calls
-    del kept
-    wrt.build([icosphere(1), icosphere(2)], accel)
-    assert calls == before
-
-
-@pytest.mark.parametrize("aov", [(), "depth"])
-def test_the_seconds_of_a_render_are_no_more_than_it_took(aov: str | tuple[str, ...]) -> None:
-    for _ in range(2):  # compiled, or from the cache of an earlier run; then kept by this process
-        begin = time.perf_counter()
-        film = wrt.render(SCENE, spp=1, size=(16, 9), aov=aov, tile_size=3)
-        whole = time.perf_counter() - begin
-        parts = film.stats["seconds"]
-        assert parts.keys() >= {"compile", "upload", "build", "trace"} and min(parts.values()) >= 0.0
-        assert max(parts.values()) <= whole and film.stats["accel"]["build_seconds"] <= parts["build"]
-        assert sum(parts[name] for name in parts if name != "compile") <= whole  # which runs beside upload and build
-
-
-def test_loading_of_kernels_does_not_count_as_building() -> None:
-    begin = build_clock()
-    with loading():
-        time.sleep(0.3)
-    assert 0.0 <= build_clock() - begin < 0.25

@@ -12,10 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.command_line import BOX_OBJ
-from tests.command_line import wrt as command
 from tests.data import ROOT
-from tests.gltf_files import one_triangle
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.accel.scenes.build import build, load_accel
@@ -74,16 +71,6 @@ def test_no_reader_waits_for_a_pipe(suffix: str, tmp_path: Path) -> None:
         readers.get(suffix, load_scene)(path)
 
 
-@pytest.mark.parametrize("uri", ["pipe", "a%00b", "."])
-def test_nor_does_a_gltf_file(uri: str, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    file = one_triangle()
-    file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
-    with refused(path="a.gltf") as caught:
-        load_scene(file.write(tmp_path, "a.gltf"))
-    assert caught.value.place.endswith("buffers[0].uri")
-
-
 # --- writing ------------------------------------------------------------------------------------------------------------
 
 
@@ -104,18 +91,6 @@ def test_what_the_system_refuses_is_one_message(name: str, write: Callable[[Path
     with refused(what="its folder does not exist", path=tmp_path / "none" / name):
         write(tmp_path / "none" / name)
     assert names(tmp_path) == {name}
-
-
-def test_a_device_and_a_folder_of_the_system_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with refused(what="no regular file"):
-        check_writable("/dev/null")
-    if Path("/proc/self").is_dir():
-        with refused(what="written", path="/proc/a.exr"):
-            write_image("/proc/a.exr", PIXELS)
-    monkeypatch.chdir(tmp_path)
-    Path("box.obj").write_text(BOX_OBJ)
-    assert command("render", "box.obj", "-o", "none/a.png").errors == ["error: none/a.png: its folder does not exist"]
-    assert names(tmp_path) == {"box.obj"}
 
 
 def test_an_error_in_the_middle_leaves_the_old_file(tmp_path: Path) -> None:

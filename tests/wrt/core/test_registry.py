@@ -32,15 +32,6 @@ def test_entries_become_what_they_name() -> None:
         table.check("float")
 
 
-def test_names_are_shown_whatever_was_imported() -> None:
-    table: Registry[type] = Registry("number", {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"})
-    before = repr(table)
-    assert before == str(table) == "Registry(number: fraction, decimal)"
-    assert table["decimal"] and repr(table) == before
-    table["own"] = int
-    assert repr(table) == "Registry(number: fraction, decimal, own)"
-
-
 def test_installed_packages_add_rows_and_replace_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "more-1.0.dist-info").mkdir()
     (tmp_path / "more-1.0.dist-info" / "entry_points.txt").write_text(
@@ -106,19 +97,6 @@ def test_help_lists_the_other_commands_and_a_line_for_each_broken_one(command: t
         assert any(line.startswith("warning: ") and f"'{name}'" in line and "odd-things" in line and why in line for line in lines), name
     assert failed.returncode == 2 and len(failed.stderr.splitlines()) == 1 and "odd-things" in failed.stderr
     assert good.returncode == 0 and good.stdout == "good\n"
-
-
-def test_build_names_a_broken_structure_and_its_package(broken: Path) -> None:
-    code = ("import wrt, warnings; from wrt.scene.shapes import icosphere\n"
-            "for name in ('raises', 'exits', 'missing', 'absent', 'no_colon', 'number'):\n"
-            "    try: wrt.build(icosphere(0), name)\n"
-            "    except wrt.InputError as error: print(error)\n"
-            "print(wrt.build(icosphere(0), 'good').name)")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(broken), os.environ.get("PYTHONPATH", ""), str(ROOT)])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    *lines, last = done.stdout.splitlines()
-    assert last == "brute_force" and len(lines) == len(BROKEN)
-    assert all("odd-things" in line and why in line for line, why in zip(lines, BROKEN.values(), strict=True))
 
 
 def test_a_render_imports_only_its_own_structure() -> None:

@@ -20,7 +20,7 @@ from wrt.core.threads import run_all, run_growing, thread_count
 def test_threads() -> None:
     assert thread_count(3) == 3 and 1 <= thread_count(None) <= (os.cpu_count() or 1)
     for wrong in (0, -1):
-        with refused("threads", "1 or more"):
+        with refused("threads", "must be 1 to"):
             thread_count(wrong)
 
 
@@ -60,13 +60,6 @@ def test_run_all_takes_part_and_begins_nothing_after_an_error() -> None:
     assert len(begun) < 10 and threading.get_ident() in seen and len(seen) == 2
 
 
-def test_run_all_within_run_all() -> None:
-    done: list[int] = []
-    for _ in range(3):
-        run_all([lambda: run_all([lambda: done.append(1)] * 5, 3)] * 20, 4)
-    assert len(done) == 300
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_run_all_has_threads_of_its_own_after_a_fork() -> None:
     code = """if True:
@@ -83,20 +76,6 @@ def test_run_all_has_threads_of_its_own_after_a_fork() -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
     """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
-
-
-def test_threads_are_kept() -> None:
-    """On a busy machine, the next call may begin before a helper is idle again; it then starts another thread."""
-    both = threading.Barrier(2)
-    seen: set[threading.Thread] = set()
-
-    def task() -> None:
-        seen.add(threading.current_thread())
-        both.wait(60.0)
-
-    for _ in range(200):
-        run_all([task] * 2, 2)
-    assert 2 <= len(seen) < 150
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -116,18 +95,3 @@ def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
     assert sorted(done) == sorted([16] + 2 * [8] + 5 * [4] + 10 * [2] + 20 * [1])
     with pytest.raises(ValueError, match="three"):
         run_growing(begin, [5], threads)
-
-
-SMALL_STACKS = """if True:
-    import threading, numpy as np, wrt
-    threading.stack_size(1 << 18)
-    accel, seen = wrt.build(wrt.Mesh(np.eye(3), [[0, 1, 2]])), []
-    thread = threading.Thread(target=lambda: seen.append(accel.closest_hit(np.zeros((1, 3)), np.ones((1, 3))).t[0]))
-    thread.start(), thread.join()
-    assert abs(seen[0] - 1 / 3) < 1e-6 and threading.stack_size(0) == 1 << 18
-"""
-
-
-def test_kernels_run_in_threads_with_small_stacks() -> None:
-    """On a stack of 256 KiB a kernel would end the process."""
-    subprocess.run([sys.executable, "-c", SMALL_STACKS], cwd=ROOT, check=True, timeout=120)

@@ -22,7 +22,7 @@ from wrt.accel.queries.tiles import tiled_width
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import AccelStats, Snapshot, Structure, check_units
 from wrt.core.arrays import to_tensor_like
-from wrt.core.checks import check_keywords, parameters_of, shown
+from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -146,7 +146,7 @@ class Accelerator:
                     threads: int | None = ..., *, out: Hits[TensorT] | None = ..., **options: Unpack[HitOptions]) -> Hits[TensorT]: ...
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                     threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
-                    invalid: str = "raise", **costs: Unpack[CostOptions]) -> Hits[Any]:
+                    invalid: str = "raise", counters: bool = False, trace: bool = False) -> Hits[Any]:
         """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
         With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
@@ -170,8 +170,8 @@ class Accelerator:
             not exist, a ray misses.
         invalid : {"raise", "miss"}
             "miss": a ray with NaN, another value that is not valid, or direction 0 misses. This reads Warp arrays on the host.
-        **costs
-            `counters=True` counts the nodes and primitives that each ray visits (`hits.counters`); `trace=True` also records every fetch.
+        counters, trace : bool
+            Count the nodes and primitives that each ray visits (`hits.counters`); `trace` also records every fetch.
 
         Returns
         -------
@@ -183,18 +183,16 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        if costs:
-            check_keywords("closest_hit", costs, CLOSEST_HIT)
         snapshot = self.snapshot  # read once, because a refit may replace it during the query
         query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else arrays_of(out), world, invalid)
-        counters = None
-        if costs and any(costs.values()):
-            counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
+        costs = None
+        if counters or trace:
+            costs = counted(snapshot, query, fetches_too=trace)
         else:
             trace_query(snapshot, query)
         t, u, v, prim_id = query.out
-        hits: Hits[Any] = Hits(t, u, v, prim_id, counters, (snapshot, query.rays, query.worlds))
+        hits: Hits[Any] = Hits(t, u, v, prim_id, costs, (snapshot, query.rays, query.worlds))
         if recording_tape() is not None:
             record(hits, t=hits.t, u=hits.u, v=hits.v)
         hits = hits if shape is None else hits.in_shape(shape)
@@ -211,17 +209,15 @@ class Accelerator:
     def any_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: TensorT | None = ..., **options: Unpack[RayOptions]) -> TensorT: ...
     def any_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                threads: int | None = None, *, out: object = None, **options: Unpack[RayOptions]) -> object:
+                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None, invalid: str = "raise") -> object:
         """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads
+        origins, directions, t_min, t_max, threads, world, invalid
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
-        **options
-            `world` and `invalid`: see `closest_hit`.
 
         Returns
         -------
@@ -233,11 +229,9 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        if options:
-            check_keywords("any_hit", options, ANY_HIT)
         snapshot = self.snapshot
         query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), threads,
-                                    None if out is None else (out,), **options)
+                                    None if out is None else (out,), world, invalid)
         trace_query(snapshot, query)
         found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
@@ -264,10 +258,6 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
     arrays = answer_arrays(types, out, n, snapshot.device if valid.as_warp else None, give is not None)
     return Query(valid, arrays, threads, check_world(snapshot, world, n), tiled_width(shape) if shape else 0), shape, give
 
-
-# Keywords of the queries.
-CLOSEST_HIT = parameters_of(Accelerator.closest_hit, *CostOptions.__annotations__)
-ANY_HIT = parameters_of(Accelerator.any_hit, *RayOptions.__annotations__)
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

@@ -15,8 +15,7 @@ from wrt.core.device import load_kernel, made_once, row_type
 from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Kernel, WarpStruct
 from wrt.core.warp_private import RawLaunch, Recorded, argument_types, array_record, record_of, struct_record
-from wrt.kernels.launch_probe import PER_THREAD, Canary, probe
-from wrt.kernels.launches import Launch
+from wrt.kernels.launches import PER_THREAD, Canary, Launch, probe
 from wrt.kernels.warp_private import fields_of
 
 STEP = 16384  # elements of a launch: some milliseconds of work, so that Ctrl-C is answered soon
