@@ -275,7 +275,7 @@ def test_bad_warp_arrays_are_named() -> None:
 
 
 def test_threads_must_be_positive() -> None:
-    with refused("threads", "1 or more"):
+    with refused("threads", "must be 1 to"):
         build(BALL).closest_hit([[0, 0, 0]], [[1, 0, 0]], threads=0)
 
 

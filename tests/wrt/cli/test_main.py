@@ -216,7 +216,7 @@ WRONG = [
     (["--filter", "nope"], "filter must be one of box"), (["--fresnel", "nope"], "fresnel must be one of exact"),
     (["--tonemap", "nope"], "tonemap must be one of none"), (["--aov", "depth,nope"], "no AOV 'nope'"),
     (["--bits", "7"], ".png is written with 8 or 16 bits, not 7"),
-    (["--threads", "0"], "threads must be 1 or more"), (["--threads", "-2"], "threads must be 1 or more"),
+    (["--threads", "0"], "threads must be 1 to"),
     (["--max-depth", "-1"], "max_depth must be 0 to 64"), (["--max-depth", "65"], "max_depth must be 0 to 64"),
     (["--min-throughput", "nan"], "min_throughput must be finite"), (["--min-throughput", "2"], "in [0, 1]"),
     (["--exposure", "nan"], "exposure must be finite"), (["--exposure", "1e9"], "exposure must be"),

@@ -368,7 +368,7 @@ def test_renders_in_other_threads(reference: Film) -> None:
     ({"accel": "nope"}, ("accel", "no structure 'nope'", None, None, "bvh")),
     ({"device": "nope"}, ("device", "no device 'nope'", None, None, "cpu")),
     ({"aov": ["depth", "nope"]}, ("aov", "no AOV 'nope'", None, None, "depth, normal")),
-    ({"threads": 0}, ("threads", "1 or more")),
+    ({"threads": 0}, ("threads", "must be 1 to")),
     ({"seed": -1}, ("seed",)), ({"seed": 2**32}, ("seed",)),
     ({"tile_size": 0}, ("tile_size",)), ({"pass_size": 0}, ("pass_size",)),
     ({"time_limit": 0.0}, ("time_limit", "more than 0")), ({"time_limit": float("nan")}, ("time_limit",)),

@@ -227,7 +227,7 @@ def test_warp_arrays_on_the_cpu_are_looked_at() -> None:
     ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, ("on_b", "whole numbers")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0, 1]}, ("on_b", "whole numbers")),
     ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, ("out", "shape (1,)")),
-    ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, ("threads", "1 or more")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, ("threads", "must be 1 to")),
 ])
 def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: Refusal) -> None:
     with refused(*said):
