@@ -188,7 +188,6 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, None), ("t_max",)),
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, 1.5), ("threads", "whole number")),
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, "2"), ("threads", "whole number")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, True), ("threads", "whole number")),
     ((np.zeros((0, 3)), np.zeros((0, 3)), 0.0, 1.0, 1.5), ("threads", "whole number")),
 ])
 @pytest.mark.filterwarnings("error")  # one message, and no other

@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry, InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, answer_arrays, arrays_of
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.observed import counted
@@ -146,7 +146,7 @@ class Accelerator:
                     threads: int | None = ..., *, out: Hits[TensorT] | None = ..., **options: Unpack[HitOptions]) -> Hits[TensorT]: ...
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                     threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
-                    invalid: str = "raise", counters: bool = False, trace: bool = False) -> Hits[Any]:
+                    invalid: str = "raise", **costs: Unpack[CostOptions]) -> Hits[Any]:
         """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
         With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
@@ -170,8 +170,8 @@ class Accelerator:
             not exist, a ray misses.
         invalid : {"raise", "miss"}
             "miss": a ray with NaN, another value that is not valid, or direction 0 misses. This reads Warp arrays on the host.
-        counters, trace : bool
-            Count the nodes and primitives that each ray visits (`hits.counters`); `trace` also records every fetch.
+        **costs
+            `counters=True` counts the nodes and primitives that each ray visits (`hits.counters`); `trace=True` also records every fetch.
 
         Returns
         -------
@@ -186,13 +186,9 @@ class Accelerator:
         snapshot = self.snapshot  # read once, because a refit may replace it during the query
         query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else arrays_of(out), world, invalid)
-        costs = None
-        if counters or trace:
-            costs = counted(snapshot, query, fetches_too=trace)
-        else:
-            trace_query(snapshot, query)
+        counters = _traced(snapshot, query, **costs)
         t, u, v, prim_id = query.out
-        hits: Hits[Any] = Hits(t, u, v, prim_id, costs, (snapshot, query.rays, query.worlds))
+        hits: Hits[Any] = Hits(t, u, v, prim_id, counters, (snapshot, query.rays, query.worlds))
         if recording_tape() is not None:
             record(hits, t=hits.t, u=hits.u, v=hits.v)
         hits = hits if shape is None else hits.in_shape(shape)
@@ -235,6 +231,14 @@ class Accelerator:
         trace_query(snapshot, query)
         found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
+
+
+def _traced(snapshot: Snapshot, query: Query, counters: bool = False, trace: bool = False) -> Counters | None:
+    """Trace the rays, and return their counters if they are asked for."""
+    if counters or trace:
+        return counted(snapshot, query, fetches_too=trace)
+    trace_query(snapshot, query)
+    return None
 
 
 def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], threads: int | None,
