@@ -205,15 +205,17 @@ class Accelerator:
     def any_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: TensorT | None = ..., **options: Unpack[RayOptions]) -> TensorT: ...
     def any_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None, invalid: str = "raise") -> object:
+                threads: int | None = None, *, out: object = None, **options: Unpack[RayOptions]) -> object:
         """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads, world, invalid
+        origins, directions, t_min, t_max, threads
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
+        **options
+            `world` and `invalid`: see `closest_hit`.
 
         Returns
         -------
@@ -227,7 +229,7 @@ class Accelerator:
         """
         snapshot = self.snapshot
         query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), threads,
-                                    None if out is None else (out,), world, invalid)
+                                    None if out is None else (out,), **options)
         trace_query(snapshot, query)
         found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
