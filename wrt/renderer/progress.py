@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from wrt.core.compiling import COMPILING
@@ -50,12 +50,7 @@ def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None
         yield None
         return
     with _bar() if sys.stderr.isatty() else nullcontext(_lines()) as report:
-
-        def report_safely(progress: Progress) -> None:
-            with suppress(OSError):  # a closed terminal (SIGHUP) must not end the render
-                report(progress)
-
-        yield report_safely
+        yield report
 
 
 @contextmanager
@@ -66,23 +61,18 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
         from rich.progress import Progress as RichProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    bar = RichProgress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task("render", total=None, note="")
+    with RichProgress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("render", total=None, note="")
 
-    def report(progress: Progress) -> None:
-        if progress.stage == "compile":
-            bar.update(task, description=COMPILING)
-            return
-        building = progress.stage == "build"
-        bar.update(task, completed=progress.done, total=progress.total, note="" if building else describe(progress),
-                   description=BUILDING if building else "render")
+        def report(progress: Progress) -> None:
+            if progress.stage == "compile":
+                bar.update(task, description=COMPILING)
+                return
+            building = progress.stage == "build"
+            bar.update(task, completed=progress.done, total=progress.total, note="" if building else describe(progress),
+                       description=BUILDING if building else "render")
 
-    bar.start()
-    try:
         yield report
-    finally:
-        with suppress(OSError):
-            bar.stop()
 
 
 def _lines() -> Callable[[Progress], None]:

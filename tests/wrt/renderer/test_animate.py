@@ -21,7 +21,7 @@ from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, scene_at
 from wrt.scene.motion import Motion
 from wrt.scene.settings import Settings
-from wrt.scene.shapes import icosphere, quad, torus
+from wrt.scene.shapes import icosphere, torus
 
 GREY = Material()
 CAMERA = Camera.look_at((0.0, 1.0, 6.0), (0.0, 0.0, 0.0))
@@ -124,9 +124,3 @@ def test_the_command_writes_frames_and_movies(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(np.asarray(movie.convert("RGB")), np.asarray(alone.convert("RGB")))
     refused = run(*common, "-o", tmp_path / "x.gif", "--fps", 0)
     assert refused.code == 2 and "fps" in refused.err and not (tmp_path / "x.gif").exists()
-
-
-def test_one_frame_of_a_still_scene_is_allowed(tmp_path: Path) -> None:
-    """A single frame needs no motion."""
-    floor = Scene((Object(quad(), (GREY,)),), cameras=(CAMERA,), settings=Settings(size=(8, 8), spp=1))
-    assert len(list(animate(floor, Animation(1, 0.0), Options()))) == 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,17 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import wrt
 from tests.kernel_tools import cpu_only
 from tests.refused import Refusal, refused
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
-from wrt.renderer import checkpoint as module
 from wrt.renderer.checkpoint import MAGIC, read
 from wrt.renderer.options import Options, Progress
-from wrt.renderer.plan import Plan
 from wrt.renderer.render import Renderer, render
-from wrt.renderer.schedule import LocalTracer, Run, Steps
+from wrt.renderer.schedule import LocalTracer, Steps
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
@@ -78,8 +74,6 @@ def files(path: Path) -> list[str]:
 @pytest.mark.parametrize(("first", "then"), [
     pytest.param({"pass_size": 24, "tile_size": 4}, {}, marks=cpu_only),  # a GPU traces all tiles of a pass at once
     ({"pass_size": 5, "tile_size": 7}, {"pass_size": 3, "tile_size": 11, "threads": 1}),
-    ({"tile_size": 3, "threads": 1}, {"pass_size": 24}),
-    ({"pass_size": 1}, {"tile_size": 1}),
 ], ids=str)
 def test_a_resumed_render_equals_an_uninterrupted_one(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
                                                       monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,39 +130,6 @@ def test_a_finished_render_can_resume_with_more_samples(path: Path, whole: Film)
         render(SCENE, spp=23, checkpoint=path, resume=True)
 
 
-def test_time_limits_one_after_another(path: Path) -> None:
-    options: dict[str, Any] = {"spp": 1 << 20, "checkpoint": path, "time_limit": 0.15}
-    films = [render(SCENE, **options)] + [render(SCENE, resume=True, **options) for _ in range(2)]
-    samples = [int(film.samples.min()) for film in films]
-    assert samples == sorted(set(samples)) and all(film.stats["timed_out"] for film in films)
-    before = [(film.stats["resumed"] or {"seconds": 0.0})["seconds"] for film in films]
-    assert all(0.1 < film.stats["seconds"]["trace"] - earlier < 2.0 for film, earlier in zip(films, before, strict=True))
-    assert same(films[-1], render(SCENE, spp=samples[-1]))
-
-
-def test_a_crop_and_groups(path: Path) -> None:
-    options: dict[str, Any] = {"crop": (7, 3, 50, 30), "target_error": 1e-9, "spp": 16, "seed": 3}
-    render(SCENE, checkpoint=path, **{**options, "spp": 4})
-    assert same(render(SCENE, checkpoint=path, resume=True, **options), render(SCENE, **options))
-
-
-def test_ctrl_c_before_the_first_new_sample_keeps_the_checkpoint(path: Path, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
-    render(SCENE, spp=10, checkpoint=path)
-    with monkeypatch.context() as patch:
-        patch.setattr(Run, "_trace_aovs", lambda self: signal.raise_signal(signal.SIGINT))
-        film = render(SCENE, checkpoint=path, resume=True, aov="depth")
-    assert film.stats["interrupted"] and (film.samples == 10).all() and read(path).samples == (10, 10)
-    assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
-
-
-def test_progress_includes_the_work_before_a_resume(path: Path) -> None:
-    render(SCENE, spp=12, checkpoint=path)
-    reported: list[Progress] = []
-    film = render(SCENE, checkpoint=path, resume=True, progress=reported.append)
-    assert reported[0].done >= film.stats["samples"] // 2 and reported[-1].done == reported[-1].total == film.stats["samples"]
-    assert reported[0].seconds >= film.stats["resumed"]["seconds"] and reported[-1].rays == film.stats["rays"]
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -197,11 +158,7 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
     render(SCENE, spp=1, checkpoint=path)
     refuses("exists already", path)
     refuses("another render: seed was 0, is 1", path, resume=True, seed=1)
-    refuses("another render: max_depth was 8, is 3", path, resume=True, max_depth=3)
-    refuses("accel was bvh, is brute", path, resume=True, accel=next(
-        name for name in wrt.ACCELERATORS if "brute" in name))
     refuses("crop was [0, 0, 61, 34], is [0, 0, 61, 33]", path, resume=True, crop=(0, 0, 61, 33))
-    refuses("instancing was auto, is never", path, resume=True, instancing="never")
     refuses("triangle was watertight, is ", path, resume=True, triangle="moeller_trumbore")
     refuses("groups of samples was 1, is 4", path, resume=True, target_error=0.1)
     refuses("other camera", path, resume=True, camera=Camera.look_at((2, 2, 4.1), (0, 0, 0)))
@@ -209,27 +166,18 @@ def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
     render(replace(SCENE, name="another name"), spp=2, checkpoint=path, resume=True, threads=1, tile_size=5, exposure=2.0)
 
 
-def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    render(SCENE, spp=1, checkpoint=path)
-    with monkeypatch.context() as patch:
-        patch.setattr(Plan, "kernels_hash", lambda self: "0" * 64)
-        refuses("other kernels", path, resume=True)
-    monkeypatch.setattr(module, "VERSION", "99.0")
-    refuses(", is 99.0", path, resume=True)
-
-
 def test_any_damage_is_noticed(path: Path) -> None:
     render(SCENE, spp=1, size=(8, 6), checkpoint=path)
     good = path.read_bytes()
     rng = np.random.default_rng(0)
-    places = {len(MAGIC), len(good) - 1, len(good) - 40, *rng.integers(len(MAGIC), len(good), 60).tolist()}
+    places = {len(MAGIC), len(good) - 1, *rng.integers(len(MAGIC), len(good), 10).tolist()}
     for place in places:
         bad = bytearray(good)
         bad[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(bad)
         with refused(what="damaged: its checksum"):
             read(path)
-    for end in {0, 1, len(MAGIC), len(good) - 1, *rng.integers(0, len(good), 20).tolist()}:
+    for end in (0, len(MAGIC), len(good) - 1):
         path.write_bytes(good[:end])
         with pytest.raises(InputError, match=r"is damaged|is no checkpoint"):
             read(path)
@@ -238,12 +186,7 @@ def test_any_damage_is_noticed(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"resume": True}, ("resume", "needs a checkpoint")), ({"checkpoint": 5}, ("checkpoint", "path")),
-    ({"checkpoint": "a", "checkpoint_every": 0}, ("checkpoint_every", "more than 0")),
-    ({"checkpoint": "a", "checkpoint_every": float("nan")}, ("checkpoint_every", "more than 0")),
-    ({"checkpoint": "a", "checkpoint_every": "60s"}, ("checkpoint_every",)),
-    ({"checkpoint": "a", "resume": 1}, ("resume",)),
-    ({"checkpoint": "nowhere/a"}, (None, "its folder does", None, "a")),
+    ({"resume": True}, ("resume", "needs a checkpoint")), ({"checkpoint": "nowhere/a"}, (None, "its folder does", None, "a")),
 ], ids=str)
 def test_wrong_options(options: dict[str, Any], message: Refusal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -271,17 +214,3 @@ def test_a_removed_folder_prevents_only_the_checkpoint(tmp_path: Path, whole: Fi
     with pytest.warns(RuntimeWarning, match="the checkpoint is not saved: .*: its folder does not exist"):
         film = render(SCENE, checkpoint=folder / "a", aov="depth", progress=take)
     assert same(film, whole) and film.stats["checkpoint"] is None and not folder.exists()
-
-
-def test_two_renders_with_one_checkpoint_leave_it_complete(path: Path, whole: Film) -> None:
-    """Each render replaces the other's checkpoint, and can resume from it."""
-    inner: list[Film] = []
-
-    def also(progress: Progress) -> None:
-        if progress.done > 0.3 * progress.total and not inner:
-            inner.append(render(SCENE, checkpoint=path, checkpoint_every=1e-9, resume=True, aov="depth", progress=stop_at(0.8)))
-        read(path)
-
-    outer = render(SCENE, checkpoint=path, checkpoint_every=1e-9, tile_size=5, aov="depth", progress=also)
-    assert same(outer, whole) and inner[0].stats["resumed"] and files(path) == [path.name]
-    assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
-import shutil
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +20,6 @@ from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE, same
-from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.image import read_channels
 from wrt.renderer import cluster
@@ -115,15 +111,6 @@ def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: 
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_an_error_on_a_worker_is_the_one_that_is_raised(threads: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(self: Any, work: Any, *rest: Any) -> Any:
-        raise InputError("not this scene", path="a.toml")
-
-    monkeypatch.setattr("wrt.renderer.prepare.Prepared.trace_tile", fails)
-    with distributed.Client(threads, set_as_default=False) as one, refused(what="not this scene", path="a.toml"):
-        render(SCENE, executor=one)
-
-
 def test_a_worker_with_another_installation_is_refused(client: Any) -> None:
     def set_version(version: str) -> None:
         from wrt.renderer.cluster import INSTALLED
@@ -187,36 +174,3 @@ def test_a_scheduler_without_workers(mesh: Path, monkeypatch: pytest.MonkeyPatch
     with distributed.LocalCluster(n_workers=0, protocol="tcp://", dashboard_address=":0", silence_logs=50) as empty:
         done = run("render", mesh, "--cluster", empty.scheduler_address)
     assert done.code == 2 and len(done.errors) == 1 and "no worker at tcp://" in done.err and "dask worker tcp://" in done.err
-
-
-@pytest.fixture
-def certificate(tmp_path: Path) -> tuple[Path, Path]:
-    """Return the certificate and the key that docs/cluster.md describes; both files give access to the cluster."""
-    if shutil.which("openssl") is None:
-        pytest.skip("needs openssl, to make a certificate")
-    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
-    (line,) = re.findall(r"^openssl [^#]*", page, re.MULTILINE)
-    done = subprocess.run(line.split(), cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return tmp_path / "wrt.pem", tmp_path / "wrt.key"
-
-
-def test_tls(certificate: tuple[Path, Path], mesh: Path) -> None:
-    """Dask's configuration, from the environment, turns TLS on; wrt needs no option for it."""
-    file, key = map(str, certificate)
-    page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
-    values = {"$PWD/wrt.pem": file, "$PWD/wrt.key": key, "true": True}
-    config = {name.lower().replace("__", "."): values[value] for name, value in re.findall(r"DASK_(DISTRIBUTED__\w+)=(\S+)", page)}
-    assert len(config) == 8 and config["distributed.comm.require_encryption"]
-    with dask.config.set(config), distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, protocol="tls://", security=distributed.Security(), silence_logs=50,
-            dashboard_address=":0") as guarded:
-        address = guarded.scheduler_address
-        assert address.startswith("tls://")
-        done = run("render", mesh, "-o", "there.exr", "--size", "32x18", "--spp", 2, "-q", "--cluster", address)
-        assert done.code == 0 and Path("there.exr").exists(), done.err
-        with dask.config.set(dict.fromkeys(name for name in config if "scheduler" not in name and "worker" not in name)):
-            for wrong in (address, address.replace("tls://", "tcp://")):
-                done = run("render", mesh, "-o", "a.exr", "-q", "--cluster", wrong)
-                assert done.code == 2 and len(done.errors) == 1 and f"no Dask scheduler at '{wrong}'" in done.err, done
-    assert not Path("a.exr").exists()

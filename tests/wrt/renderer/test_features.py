@@ -178,12 +178,3 @@ def test_describe_counts_and_names() -> None:
     assert found["materials"] == ["bottle (glass)", "1 (diffuse)"] and found["cameras"] == ["front", "1"]
     assert np.allclose(found["bounds_high"], [2.0, 6.0, 2.0], atol=0.1)
     assert found["features"] == switches(features_of(scene, scene.camera()))
-
-
-def test_emission_by_texture_or_alpha_is_seen_but_does_not_light() -> None:
-    # Light sampling must not use more emission than the camera sees: here the texture of the lamp is black.
-    black = Texture(np.zeros((1, 1, 4), np.uint8))
-    lamp = Material(emission=(3, 3, 3))
-    assert lamp.lights_others
-    for hidden in ({"emission_texture": black}, {"alpha_mode": "mask"}, {"alpha_mode": "blend"}, {"emits_light": False}):
-        assert not replace(lamp, **hidden).lights_others

@@ -64,20 +64,3 @@ def test_a_toml_scene_that_says_nothing_takes_what_its_included_file_needs(tmp_p
     for include in ('["block.glb"]', '[{ file = "block.glb", transform = { scale = 2 } }]'):
         (tmp_path / "scene.toml").write_text(f"include = {include}\n{text}")
         assert wrt.load_scene(tmp_path / "scene.toml").settings.glass_shadows == expected
-
-
-def test_glass_of_a_toml_scene_alone_casts_opaque_shadows(tmp_path: Path) -> None:
-    (tmp_path / "scene.toml").write_text("""
-[materials.glass]
-kind = "glass"
-[[spheres]]
-center = [0, 0, 0]
-radius = 1
-material = "glass"
-[cameras.a]
-position = [0, 0, 5]
-target = [0, 0, 0]
-[background]
-type = "gradient"
-""")
-    assert wrt.load_scene(tmp_path / "scene.toml").settings.glass_shadows == "opaque"

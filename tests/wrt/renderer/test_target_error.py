@@ -12,7 +12,6 @@ import pytest
 import wrt
 from tests.command_line import wrt as run_command
 from tests.data import ROOT
-from tests.refused import refused
 from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
 from wrt.renderer.film import GROUPS
@@ -78,8 +77,7 @@ def test_the_picture_is_the_mean_of_independent_ones() -> None:
         assert film.stats[name] == sum(part.stats[name] for part in parts)
 
 
-@pytest.mark.parametrize("how", [{"threads": 1, "tile_size": 1000}, {"threads": 2, "tile_size": 5}, {"pass_size": 1},
-                                 {"pass_size": 3, "threads": 2, "tile_size": 16}, {"pass_size": 1000}])
+@pytest.mark.parametrize("how", [{"threads": 1, "tile_size": 1000}, {"pass_size": 3, "threads": 2, "tile_size": 16}])
 def test_same_pixels_for_any_tiles_threads_and_passes(how: dict[str, Any]) -> None:
     expected, film = (render(SCENE, target_error=0.02, **options) for options in ({}, how))
     for name in ("pixels", "variance", "samples"):
@@ -87,21 +85,6 @@ def test_same_pixels_for_any_tiles_threads_and_passes(how: dict[str, Any]) -> No
     for name in ("estimated_error", "rays", "cut_by_depth", "cut_by_throughput", "lost_throughput_per_sample"):
         assert film.stats[name] == expected.stats[name], name
     assert expected.stats["lost_throughput_per_sample"] > 0.0
-
-
-def test_a_crop_counts_its_own_error_only() -> None:
-    dark = render(SCENE, target_error=1e-9, spp=16, crop=(0, 0, 3, 2))  # only black background above the floor
-    assert dark.stats["estimated_error"] == 0.0 and dark.stats["target_reached"]
-    whole, crop = (render(SCENE, target_error=1e-9, spp=16, crop=crop) for crop in (None, (4, 6, 20, 14)))
-    assert np.array_equal(crop.pixels, whole.pixels[6:14, 4:20])
-    expected = math.sqrt(whole.variance[6:14, 4:20].mean(dtype=np.float64))
-    assert crop.stats["estimated_error"] == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
-def test_a_black_picture_has_no_error_at_all() -> None:
-    film = render(Scene(cameras=SCENE.cameras, settings=SCENE.settings), target_error=1e-12)
-    assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0
 
 
 def test_the_error_is_infinite_until_every_pixel_has_samples(tmp_path: Any) -> None:
@@ -132,12 +115,6 @@ def test_time_limit_and_interrupt_end_a_render_with_a_target() -> None:
     film = render(SCENE, target_error=1e-9, progress=stop)
     assert film.stats["interrupted"] and not film.stats["timed_out"] and not film.stats["target_reached"]
     assert np.isfinite(film.pixels).all() and (film.samples % GROUPS == 0).all()
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_a_target_must_be_a_positive_number(bad: float) -> None:
-    with refused("target_error", "more than 0"):
-        render(SCENE, target_error=bad)
 
 
 def test_the_command_line(tmp_path: Any) -> None:
@@ -180,7 +157,7 @@ def truth_of_scene() -> tuple[np.ndarray, float]:
 
 
 @pytest.mark.parametrize(("name", "size", "spps"), [
-    ("whitted", (32, 18), (16, 128)), ("lens", (32, 18), (16, 128)),
+    ("whitted", (32, 18), (16, 128)),
     *(pytest.param(name, (96, 54), (8, 32, 128, 512), marks=pytest.mark.slow)
       for name in ("whitted", "cornell_box", "lens", "frosted", "environment"))], ids=str)
 def test_the_estimate_is_the_true_error(name: str, size: tuple[int, int], spps: tuple[int, ...]) -> None:

@@ -80,12 +80,6 @@ def test_pictures_of_a_files_own_lights_are_exposed_and_an_exposure_ends_that(tm
     assert bright == pytest.approx(0.8, rel=0.01)
 
 
-def test_a_camera_in_a_closed_box_sees_nothing_and_that_is_told(tmp_path: Path) -> None:
-    pixels, told = rendered(gltf_box(tmp_path, -4, 4, translation=[0, 0, 0]))
-    assert not pixels.any()
-    assert len(told) == 2 and "a key light" in told[0] and "the picture is all black" in told[1]
-
-
 def test_a_scene_without_any_light_is_told_unless_it_is_rendered_for_its_aovs() -> None:
     scene = wrt.Scene(spheres=[wrt.Sphere((0.0, 0.0, -3.0), 1.0)], cameras=[wrt.Camera(np.eye(4))])
     with pytest.warns(wrt.SceneWarning, match="all black: the scene has no lights, no background"):

@@ -24,7 +24,6 @@ from wrt.renderer.upload import (
     camera_struct,
     light_records,
     material_records,
-    srgb_table,
     unit_normals,
     upload_scene,
 )
@@ -77,13 +76,6 @@ def test_outside_stays_outside_and_normals_stay_normal(name: str) -> None:
     assert (np.sort(placed.faces, axis=1) == np.sort(ball.faces, axis=1)).all()
 
 
-def test_the_identity_changes_nothing() -> None:
-    ball = icosphere(1)
-    world = flatten_joined(Scene(objects=(Object(ball, (GREY,)),)))
-    assert np.array_equal(world.geometry.vertices, ball.vertices) and np.array_equal(world.geometry.faces, ball.faces)
-    assert np.array_equal(world.normals, ball.normals) and world.uvs.shape == (len(ball.vertices), 2)
-
-
 def test_a_flattened_object_has_finite_normals() -> None:
     flat = transform([[1, 0, 0], [0, 0, 0], [0, 0, 1]])
     world = flatten_joined(Scene(objects=(Object(icosphere(1), (GREY,), flat),)))
@@ -109,11 +101,6 @@ def test_objects_are_joined_with_their_materials() -> None:
     assert smooth.normals is not None and not smooth.normals[:4].any() and smooth.normals[4:].any()
 
 
-def test_an_empty_scene_uploads() -> None:
-    device = upload_scene(Scene(), DEVICE)
-    assert len(device.world.geometry) == 0 and device.surfaces.n_triangles == 0 and device.lighting.count == 0
-
-
 def test_material_records_keep_every_value() -> None:
     picture, board = Texture(np.zeros((2, 3, 4), np.uint8)), Checkerboard()
     a = Material("glass", albedo=(0.1, 0.2, 0.3), ior=1.7, absorption=(4, 5, 6), thin=True, roughness=0.25, alpha=0.5,
@@ -135,13 +122,6 @@ def test_material_records_keep_every_value() -> None:
     assert len(table.rows) == 3 and table.size == 6  # the image that two textures share is stored once
     first = table.records()["first"]
     assert first[0] == first[2] == 0 and table.records()["width"].tolist() == [3, 0, 3]
-
-
-def test_srgb_table() -> None:
-    table = srgb_table()
-    assert table.shape == (512,) and table[0] == table[256] == 0.0 and table[255] == table[511] == 1.0
-    assert table[188] == pytest.approx(0.5029, abs=1e-4) and (np.diff(table[:256]) > 0).all()
-    assert np.allclose(table[256:], np.arange(256) / 255.0)
 
 
 def test_lights_without_area() -> None:
@@ -261,13 +241,6 @@ def test_emitters_without_area_or_light_are_never_chosen() -> None:
     assert len(light_records(flat, flatten_joined(flat))[0]) == 0
 
 
-def test_glowing_spheres() -> None:
-    scene = Scene(spheres=(Sphere((0, 1, 0), 0.5, Material(emission=(1, 2, 3))), Sphere((5, 1, 0), 0.5, GREY)))
-    rows, *_ = light_records(scene, flatten_joined(scene))
-    assert len(rows) == 1 and rows["kind"][0] == list(lights.LIGHTS).index("sphere") and rows["radius"][0] == 0.5
-    assert rows["position"][0].tolist() == [0, 1, 0] and rows["color"][0].tolist() == [1, 2, 3]
-
-
 def test_backgrounds() -> None:
     flat = upload_scene(Scene(background=ConstantBackground((1, 2, 3))), DEVICE).lighting.background
     assert list(flat.bottom) == list(flat.top) == [1, 2, 3]
@@ -303,9 +276,3 @@ def test_camera_struct(size: tuple[int, int]) -> None:
     assert np.linalg.det(frame) == pytest.approx(-1.0, abs=1e-6)  # right, up and -forward are right-handed
     assert c.tan_y == pytest.approx(np.tan(0.4)) and c.tan_x == pytest.approx(np.tan(0.4) * size[0] / size[1])
     assert (c.blades, c.focus_distance) == (5, 7.0) and c.aperture_radius == pytest.approx(0.2)
-
-
-def test_a_mirrored_or_scaled_camera_pose_is_only_a_pose() -> None:
-    scaled = Camera(camera_to_world=np.diag([5.0, 2.0, 3.0, 1.0]))
-    c = camera_struct(scaled, (4, 4))
-    assert np.allclose([c.right, c.up, c.forward], [[1, 0, 0], [0, 1, 0], [0, 0, -1]])

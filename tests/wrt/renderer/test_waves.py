@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -175,33 +174,3 @@ def test_scenes_share_what_they_have_in_common() -> None:
     assert len({kernels.shade for kernels in of.values()}) == 3
     deeper = load_scene(SCENES / "whitted.toml").with_settings(max_depth=64)
     assert plan_of(deeper, Options(device="cpu")).wave_kernels == of["whitted"]
-
-
-def test_waves_are_smaller_where_each_sample_takes_more_room() -> None:
-    features = plan_of(load_scene(SCENES / "whitted.toml"), Options()).features
-    assert waves.Buffers(features, 2).capacity == waves.CAPACITY
-    many = waves.Buffers(features, 1000)
-    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.shadows.value) == 1000 * many.capacity <= waves.MAX_SLOTS
-    assert waves.Buffers(replace(features, stack_size=1 << 20), 1).capacity == 64
-
-
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (32, 32), (5, 9), (64, 3)])
-def test_neighbours_are_next_to_each_other(width: int, height: int) -> None:
-    order = waves.block_order(width, height)
-    assert sorted(order) == list(range(width * height))
-    y, x = np.divmod(order, width)
-    whole = (x // 4 < width // 4) & (y // 4 < height // 4)
-    if width % 4 == 0 and height % 4 == 0:
-        assert whole.all()
-        for block in order.reshape(-1, 16):
-            assert np.ptp(block % width) == np.ptp(block // width) == 3
-
-
-def test_only_the_cpu_has_waves() -> None:
-    plan = plan_of(load_scene(SCENES / "fisheye.toml"), Options(device="cpu"))
-    on_cuda = copy(plan.options)
-    on_cuda.device = "cuda:0"
-    assert plan.by_waves and not replace(plan, options=on_cuda).by_waves
-    counting = plan.structure._replace(units=plan.structure.units._replace(observer="sum"))
-    assert not replace(plan, structure=counting).by_waves
-    assert all(isinstance(kernel, wp.Kernel) for kernel in plan.kernels)

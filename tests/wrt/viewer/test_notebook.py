@@ -17,12 +17,10 @@ import pytest
 from PIL import Image
 
 import wrt
-from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
-from wrt.core.tables import SHOWN_ROWS, Rows, html_table, number
+from wrt.core.tables import html_table
 from wrt.renderer.options import Progress
-from wrt.scene.shapes import box
 from wrt.viewer.notebook import LiveView
 
 # --- the picture so far -----------------------------------------------------------------------------------------------
@@ -83,13 +81,6 @@ def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeyp
     view(Progress(1, 10, 5, 1.0, note="<b>the disk is full</b>"))
     assert all("<img" not in page for _, page in shown) and "compiling" in shown[0][1] and "30% build" in shown[1][1]
     assert "&lt;b&gt;the disk is full" in shown[2][1]
-
-
-def test_without_a_notebook_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "IPython", None)
-    monkeypatch.setitem(sys.modules, "IPython.display", None)
-    with refused(what="IPython is not installed"):
-        LiveView()
 
 
 def test_the_picture_in_progress_is_that_of_the_samples_so_far() -> None:
@@ -158,33 +149,6 @@ EVIL = "<script>alert('\"&')</script>"
 
 def test_nothing_in_a_table_is_markup() -> None:
     assert Tables(html_table(EVIL, (EVIL,), [(EVIL,), (1,)])).rows == [[EVIL], [EVIL], ["1"]]
-
-
-def test_numbers_and_long_tables() -> None:
-    assert [number(x) for x in (1234567, 0.123456, np.float32(2.5), np.int64(4000), True, "a", None, float("nan"))] == [
-        "1,234,567", "0.1235", "2.5", "4,000", "True", "a", "None", "nan"]
-    page = html_table("", ("i",), ((i,) for i in range(SHOWN_ROWS + 7)))
-    assert len(Tables(page).rows) == SHOWN_ROWS + 1 and "and 7 more" in page
-    assert Tables(html_table("t", (), {"a": 1.5, "b": "x"}.items())).rows == [["a", "1.5"], ["b", "x"]]
-
-
-def test_hits_and_counters_as_tables() -> None:
-    accel = wrt.build(box(), "bvh")
-    directions = np.array([(0, 0, -1), (0, 0, 1), (0, 1, 0)], np.float32)
-    hits = accel.closest_hit(np.full((3, 3), (0.1, 0.2, 5.0), np.float32), directions, counters=True)
-    rows3 = Tables(hits._repr_html_()).rows
-    assert ["rays", "3"] in rows3 and ["hits", "1"] in rows3 and ["misses", "2"] in rows3 and ["nearest t", "4.5"] in rows3
-    assert hits.counters is not None
-    nodes = hits.counters.counts["nodes"]
-    assert ["nodes", number(float(nodes.mean())), str(nodes.max()), str(nodes.sum())] in rows3
-    empty = accel.closest_hit(np.zeros((0, 3)), np.zeros((0, 3)), counters=True)
-    assert ["rays", "0"] in Tables(empty._repr_html_()).rows
-
-
-def test_a_list_of_rows_is_a_list_with_a_page() -> None:
-    rows = Rows([2, 1], lambda rows: html_table("", ("n", "text"), [(n, f"{n}.5 ± 1") for n in rows]))
-    assert rows == [2, 1] and sorted(rows) == [1, 2] and rows[0] == 2
-    assert Tables(rows._repr_html_()).rows == [["n", "text"], ["2", "2.5 ± 1"], ["1", "1.5 ± 1"]]
 
 
 def test_reports_are_tables(monkeypatch: pytest.MonkeyPatch) -> None:
