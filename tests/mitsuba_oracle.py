@@ -11,7 +11,7 @@ import numpy as np
 from tests.mitsuba_whitted import whitted
 from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba, translate
-from wrt.renderer.pixel_rays import camera_rays
+from wrt.renderer.upload import camera_rays
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh

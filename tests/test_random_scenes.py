@@ -6,7 +6,7 @@ import pytest
 
 from tests import random_fields
 from tests.random_scenes import Outcome, plan_of_scene, render
-from wrt.renderer.features import switches
+from wrt.renderer.plan import switches
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS
 from wrt.scene.kinds import forms

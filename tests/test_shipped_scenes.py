@@ -23,8 +23,7 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-from wrt.renderer.features import features_of, switches
-from wrt.renderer.plan import aov_kernel, render_kernel
+from wrt.renderer.plan import aov_kernel, features_of, render_kernel, switches
 from wrt.scene.cameras import CAMERAS
 from wrt.scene.model import Scene
 

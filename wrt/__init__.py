@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from wrt.renderer.inspector.inspect import inspect as inspect
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
-    from wrt.renderer.pixel_rays import camera_rays as camera_rays
     from wrt.renderer.render import render as render
+    from wrt.renderer.upload import camera_rays as camera_rays
     from wrt.scene.backgrounds import ConstantBackground as ConstantBackground
     from wrt.scene.backgrounds import EnvironmentBackground as EnvironmentBackground
     from wrt.scene.backgrounds import GradientBackground as GradientBackground

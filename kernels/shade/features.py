@@ -1,4 +1,4 @@
-"""The switches that a render kernel is compiled from; wrt.renderer.features derives them from a scene."""
+"""The switches that a render kernel is compiled from; wrt.renderer.plan derives them from a scene."""
 
 from dataclasses import dataclass
 

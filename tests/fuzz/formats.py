@@ -402,7 +402,7 @@ def render_scene(path: Path) -> object:
 
     from wrt.kernels.shade.features import Features
     from wrt.renderer import plan
-    from wrt.renderer.features import STACK_STEP
+    from wrt.renderer.plan import STACK_STEP
     from wrt.renderer.render import render
     from wrt.scene.lights import EMISSIVE, LIGHTS
     from wrt.scene.materials import MATERIALS

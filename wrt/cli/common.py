@@ -272,7 +272,7 @@ def client_of(cluster: str | None) -> "Client | None":
     """Return a Dask client of the scheduler at address `cluster`, connected until the command ends; None if `cluster` is None."""
     if cluster is None:
         return None
-    from wrt.renderer.cluster import connected
+    from wrt.renderer.workers import connected
 
     return click.get_current_context().with_resource(connected(cluster))
 

@@ -15,7 +15,7 @@ from wrt.scene.settings import TONEMAPS
 @shared("scene", "camera", "assignments", "as_json")
 def info(scene: Path, camera: str | None, assignments: Assignments, as_json: bool) -> None:
     """Describe SCENE, and list the features of its render kernels."""
-    from wrt.renderer.features import describe
+    from wrt.renderer.plan import describe
 
     settings = settings_of(assignments)
     loaded = load(scene, quiet=False).with_settings(**settings)

@@ -16,6 +16,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.core.files import check_writable, read_checked, replacing, write_checked
 from wrt.core.settings import VERSION
+from wrt.core.types import PathLike
 from wrt.renderer.film import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
@@ -38,7 +39,7 @@ class Saved(NamedTuple):
     body: memoryview  # The film's arrays, in the order of DeviceFilm.arrays.
 
 
-def read(path: str | os.PathLike[str]) -> Saved:
+def read(path: PathLike) -> Saved:
     """Read a checkpoint. Raises InputError if the file is missing, damaged, of another version, or no checkpoint."""
     try:
         with read_checked(path, MAGIC, "checkpoint") as (header, body):
@@ -104,18 +105,14 @@ class Checkpoint:
         self.saved = self.saved._replace(body=memoryview(b""))  # free the memory of the file's contents
 
 
-def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
-    """Return the checkpoint that the plan's options ask for, or None. kind: kind of the device (wrt.renderer.prepare.kind_of).
-
-    Raises InputError if the checkpoint cannot be written or resumed."""
+def checkpoint_of(plan: Plan, path: PathLike, kind: str) -> Checkpoint:
+    """Return the checkpoint at `path`. kind: kind of the device (prepare.kind_of). Raises InputError if it cannot be written or resumed."""
     options, settings = plan.options, plan.scene.settings
-    if options.checkpoint is None:
-        return None
     identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
     identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
     identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": digest(plan.scene),
                  "camera": digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
-    file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, resume=options.resume)
+    file = Checkpoint(Path(path), options.checkpoint_every, identity, resume=options.resume)
     samples = 0 if file.saved is None else file.saved.samples[1]
     if samples > max(1, settings.spp // plan.groups):
         raise InputError(f"must be {samples * plan.groups} or more, the samples per pixel in this checkpoint; got {settings.spp}",

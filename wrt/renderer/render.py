@@ -148,7 +148,11 @@ class Renderer:
         device = start(options.device)
         plan = plan_of(scene, options)
         plan.require_memory(device)
-        self.checkpoint = opened_checkpoint(plan, kind_of(device))
+        self.checkpoint: Checkpoint | None = None
+        if options.checkpoint is not None:
+            from wrt.renderer.checkpoint import checkpoint_of
+
+            self.checkpoint = checkpoint_of(plan, options.checkpoint, kind_of(device))
         if once and (builder := builder_for(plan)):  # the checkpoint does not contain it: a resumed render may use another tree
             plan = replace(plan, options=replace(options, accel_options=builder | options.accel_options))
         self.prepared = prepare(plan, device)
@@ -201,12 +205,3 @@ def builder_for(plan: Plan) -> dict[str, str]:
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
     """Return True if only vertex positions differ. A face whose corners become collinear is left out, so that the faces differ."""
     return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces) and before.vertices.shape == now.vertices.shape)
-
-
-def opened_checkpoint(plan: Plan, kind: str) -> Checkpoint | None:
-    """Return the checkpoint that the plan's options ask for, or None. kind: result of kind_of."""
-    if plan.options.checkpoint is None:
-        return None
-    from wrt.renderer.checkpoint import checkpoint_of
-
-    return checkpoint_of(plan, kind)

@@ -1,4 +1,4 @@
-"""Upload of a scene to a device: geometry, and tables of materials, textures and lights."""
+"""Upload of a scene to a device: geometry, tables of materials, textures and lights, and cameras, whose rays are there for queries."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -11,21 +11,23 @@ import warp as wp
 
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.queries.hit_points import instance_records
+from wrt.accel.queries.rays import to_origin
 from wrt.accel.scenes.flatten import flatten
-from wrt.core.checks import listed
-from wrt.core.device import records, upload
+from wrt.core.checks import as_one, as_size, listed
+from wrt.core.device import launch, made_once, records, start, upload
 from wrt.core.errors import InputError, warn
 from wrt.core.types import Device, WarpStruct
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
+from wrt.kernels.shade.cameras import make_camera_rays_kernel
 from wrt.kernels.warp_private import fields_of
 from wrt.picture.tonemap import decode_srgb
 from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import CameraKind
 from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
 from wrt.scene.model import Scene
-from wrt.scene.size import require_size
-from wrt.scene.values import LUMINANCE
+from wrt.scene.size import moved_camera, require_size
+from wrt.scene.values import LUMINANCE, type_of
 
 # If a scene has more emissive objects, they are sampled as one light, by power, since a shadow ray to each would cost too much.
 MAX_MESH_LIGHTS = 16
@@ -272,3 +274,45 @@ def camera_struct(camera: CameraKind, size: tuple[int, int]) -> WarpStruct:
     for name, value in camera.record(size).items():
         setattr(c, name, value)
     return c
+
+
+# --- camera rays, for queries -----------------------------------------------------------------------------------------
+
+
+camera_rays_kernel = made_once(make_camera_rays_kernel)
+
+
+def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
+    """Make one ray for each pixel, through the centres of the lens and of the pixel. The AOVs of a Film come from the same rays.
+
+    Parameters
+    ----------
+    camera
+        A camera of any kind.
+    size
+        Width and height of the picture, or text such as "640x360".
+
+    Returns
+    -------
+    origins, directions
+        (width * height, 3) float32 each, in world space, row by row from the top left. Origins farther than 1,024 from 0 are float64, if
+        float32 would round them. Directions have unit length, so that a hit's t is the AOV "depth". Beyond the image circle of a
+        fisheye, directions are 0.
+    """
+    width, height = as_size(size)
+    x = (np.arange(width, dtype=np.float32) + np.float32(0.5)) / np.float32(width)
+    y = (np.arange(height, dtype=np.float32) + np.float32(0.5)) / np.float32(height)
+    film = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
+    return film_rays(camera, (width, height), film.reshape(-1, 2))
+
+
+def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make rays through the points `film` (N, 2) of a picture; its top left corner is (0, 0), its bottom right corner (1, 1)."""
+    device = start("cpu")
+    kernel = camera_rays_kernel(import_module(as_one(camera, CameraKind, "camera").device))
+    place = camera.camera_to_world[:3, 3]
+    far = place if type_of(place) is np.float64 else None
+    camera = moved_camera(camera, far)
+    origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))
+    launch(kernel, len(film), camera_struct(camera, size), upload(film, wp.vec2, device), origins, directions)
+    return to_origin(origins.numpy(), far), directions.numpy()

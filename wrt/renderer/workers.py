@@ -5,29 +5,37 @@ it, also again after another worker died. A worker process prepares a scene once
 and controls passes, limits and checkpoints (wrt.renderer.schedule).
 """
 
+import logging
 import math
 import os
 import pickle
+import pkgutil
 import socket
+import sys
 import threading
 import time
 import warnings
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
-from contextlib import closing, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import warp as wp
 
 from wrt.core.compiling import WATCH
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
+from wrt.core.settings import VERSION
 from wrt.core.threads import Pool
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
-from wrt.renderer.cluster import INSTALLED, check_installed, check_workers
 from wrt.renderer.film import AovFilm, DeviceFilm, Rectangle, Work, tiles
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
@@ -37,6 +45,11 @@ from wrt.renderer.upload import warn_left_out
 from wrt.scene.digest import digest
 from wrt.scene.model import Scene
 
+if TYPE_CHECKING:
+    from distributed import Client
+
+CONNECT_SECONDS = 5.0  # time limit for reaching the scheduler
+WORKER_SECONDS = 10.0  # time limit for the first worker to connect
 QUEUED = 3  # Submitted jobs for each slot, so that no worker is idle.
 SLOTS = 32  # Assumed number of slots of an executor that does not state it.
 CACHED = 2  # Largest number of prepared scenes in a worker process.
@@ -47,6 +60,66 @@ LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, 
 
 Job = tuple[Any, ...]  # The name of a method of Prepared, and its arguments.
 Reply = tuple[str, str, Any]  # The worker's name, the kind of its device (kind_of), and the result of the method.
+
+
+# --- installations, and Dask's scheduler ------------------------------------------------------------------------------
+
+
+def _code() -> str:
+    """Return a digest of the source files of wrt and kernels: two checkouts of one version can differ in any line."""
+    folders = [("", Path(__file__).parents[1]), *(("kernels/", Path(folder)) for folder in import_module("wrt.kernels").__path__)]
+    files = {before + path.relative_to(folder).as_posix(): path.read_bytes()
+             for before, folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".h", ".cpp", ".cu")}
+    return sha256(b"".join(name.encode() + sha256(files[name]).digest() for name in sorted(files))).hexdigest()[:16]
+
+
+# What can change a bit of a result and must be equal on all machines that share work. It is read once, at import, because a file that
+# changes later is not the code that runs. A minor version of Python can change arithmetic, as 3.12 changed the sum() of floats.
+INSTALLED = {"wrt": VERSION, "Python": "{}.{}".format(*sys.version_info), "NumPy": np.__version__, "Warp": wp.__version__,
+             "code of wrt": _code()}
+
+
+def check_installed(worker: str, there: dict[str, str], here: dict[str, str] = INSTALLED) -> None:
+    """Raise InputError if the installation `there`, of a worker, differs from the installation `here`."""
+    differ = [f"{name} {there.get(name)} (here {value})" for name, value in here.items() if there.get(name) != value]
+    if differ:
+        raise InputError(f"worker {worker} has {'; '.join(differ)}", hint="install the same everywhere")
+
+
+@contextmanager
+def connected(address: str) -> "Iterator[Client]":
+    """Yield a dask.distributed.Client of the scheduler at an address such as tcp://host:8786.
+
+    Raises InputError if the scheduler does not answer or has no worker, or if a worker has a different installation."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("a cluster needs dask.distributed", hint="pip install 'wrt[cluster]'") from None
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # InputError reports the errors
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except Exception as error:  # if another program answers, the error can have any type
+        raise InputError(f"no Dask scheduler at {address!r}: {error or f'no answer in {CONNECT_SECONDS:g} s'}") from error
+    with client:
+        check_workers(client)
+        yield client
+
+
+def check_workers(client: "Client") -> None:
+    """Raise InputError if there is no worker, or if a worker lacks wrt or has a different installation than this process."""
+    if client.asynchronous:
+        raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
+    where = client.scheduler.address  # type: ignore[union-attr]
+    try:
+        client.wait_for_workers(1, timeout=WORKER_SECONDS)
+    except TimeoutError as error:
+        raise InputError(f"no worker at {where}", hint=f"start some with `dask worker {where}`") from error
+    # Workers without wrt can run `resolve_name`.
+    for worker, found in client.run(pkgutil.resolve_name, "wrt.renderer.workers:INSTALLED", on_error="return").items():
+        if isinstance(found, BaseException):
+            raise InputError(f"worker {worker} lacks this version of wrt ({found})", hint=f"install wrt {VERSION} on the worker")
+        check_installed(worker, found)
 
 
 # --- in a worker ------------------------------------------------------------------------------------------------------
@@ -262,4 +335,4 @@ def render_with_workers(scene: Scene, options: Options) -> Film:
     plan.require_memory(start("cpu"))
     warn_left_out(scene)
     tracer = WorkersTracer(plan, workers_for(plan))
-    return Run(tracer, checkpoint_of(plan, tracer.kind) if options.checkpoint is not None else None).film()
+    return Run(tracer, None if options.checkpoint is None else checkpoint_of(plan, options.checkpoint, tracer.kind)).film()

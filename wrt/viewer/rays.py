@@ -12,8 +12,8 @@ from wrt.renderer.inspector.assemble import Assembler
 from wrt.renderer.inspector.drawing import COLORS, frame_points, strokes_of
 from wrt.renderer.inspector.inspect import Inspector
 from wrt.renderer.inspector.tree import Light, Ray, Sample, color, describe_light, describe_ray
-from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.prepare import Prepared
+from wrt.renderer.upload import film_rays
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.viewer.refine import Renderers, View, kind_of
 

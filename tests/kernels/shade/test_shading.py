@@ -17,7 +17,7 @@ from wrt.kernels.shade.shading import make_resolve, textures_of
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.warp_private import fields_of
-from wrt.renderer.features import features_of
+from wrt.renderer.plan import features_of
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import MATERIALS, SLOTS, Material, Texture
 from wrt.scene.model import Object, Scene

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from tests.known_answers.test_integrator import CLEAR, MIRROR_BOX, ONE
-from wrt.renderer.features import switches
 from wrt.renderer.options import Options
-from wrt.renderer.plan import plan_of
+from wrt.renderer.plan import plan_of, switches
 from wrt.renderer.render import render
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera

@@ -29,8 +29,8 @@ from wrt.io.load import load_scene, schema
 from wrt.picture import film as film_module
 from wrt.picture.image import read_channels, read_image, write_image
 from wrt.renderer import progress as progress_module
-from wrt.renderer.features import features_of, switches
 from wrt.renderer.options import Progress
+from wrt.renderer.plan import features_of, switches
 from wrt.renderer.schedule import film_of
 
 SMALL = ("--size", "32x18", "--spp", 2)

@@ -22,7 +22,7 @@ from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt.picture.film import Film
 from wrt.picture.image import read_channels
-from wrt.renderer import cluster
+from wrt.renderer import workers
 from wrt.renderer.render import render
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
@@ -113,17 +113,17 @@ def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: 
 
 def test_a_worker_with_another_installation_is_refused(client: Any) -> None:
     def set_version(version: str) -> None:
-        from wrt.renderer.cluster import INSTALLED
+        from wrt.renderer.workers import INSTALLED
 
         INSTALLED["Warp"] = version
 
     first = next(iter(client.scheduler_info()["workers"]))
     client.run(set_version, "0.9", workers=[first])
     try:
-        with refused(what=f"worker {first} has Warp 0.9 (here {cluster.INSTALLED['Warp']})"):
+        with refused(what=f"worker {first} has Warp 0.9 (here {workers.INSTALLED['Warp']})"):
             render(SCENE, executor=client)
     finally:
-        client.run(set_version, cluster.INSTALLED["Warp"], workers=[first])
+        client.run(set_version, workers.INSTALLED["Warp"], workers=[first])
 
 
 # --- the command line -------------------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def test_commands(threads: Any, mesh: Path) -> None:
 
 
 def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 0.3)
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         for address in (f"tcp://127.0.0.1:{closed.getsockname()[1]}", "nonsense", "", "ftp://127.0.0.1:1"):
@@ -170,7 +170,7 @@ def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_scheduler_without_workers(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "WORKER_SECONDS", 0.3)
+    monkeypatch.setattr(workers, "WORKER_SECONDS", 0.3)
     with distributed.LocalCluster(n_workers=0, protocol="tcp://", dashboard_address=":0", silence_logs=50) as empty:
         done = run("render", mesh, "--cluster", empty.scheduler_address)
     assert done.code == 2 and len(done.errors) == 1 and "no worker at tcp://" in done.err and "dask worker tcp://" in done.err

@@ -27,10 +27,10 @@ from wrt.io.load import load_scene
 from wrt.picture.film import Film
 from wrt.renderer import workers
 from wrt.renderer.animate import Animation, animate
-from wrt.renderer.cluster import INSTALLED
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.render import render
+from wrt.renderer.workers import INSTALLED
 from wrt.scene.digest import digest
 
 # The picture is smaller than the smallest default tile, so tile_size is set.
@@ -193,7 +193,7 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "kernels", tmp_path / "wrt" / "kernels", ignore=shutil.ignore_patterns("__pycache__"))
 
     def digest_there() -> str:
-        code = "from wrt.renderer.cluster import INSTALLED; print(INSTALLED['code of wrt'])"
+        code = "from wrt.renderer.workers import INSTALLED; print(INSTALLED['code of wrt'])"
         done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)},
                               capture_output=True, text=True, check=True)
         return done.stdout.strip()

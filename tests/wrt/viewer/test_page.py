@@ -29,8 +29,8 @@ from tests.data import ROOT
 from tests.wrt.viewer.client import Client, answer, client, wait
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
 from wrt.renderer.options import Options
-from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.render import render
+from wrt.renderer.upload import film_rays
 from wrt.scene.cameras import Camera, OrthographicCamera
 from wrt.viewer.access import Place
 from wrt.viewer.rays import project

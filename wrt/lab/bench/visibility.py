@@ -19,8 +19,7 @@ from wrt.lab.bench import Visibility as Plan
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.timing import alternate, spread
-from wrt.renderer.pixel_rays import camera_rays
-from wrt.renderer.upload import camera_struct
+from wrt.renderer.upload import camera_rays, camera_struct
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import frame_camera
 from wrt.scene.materials import Material

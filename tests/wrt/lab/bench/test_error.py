@@ -24,8 +24,8 @@ from wrt.lab.bench import error as bench
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import BASE
 from wrt.lab.bench.report import Row, cells
-from wrt.renderer.features import features_of
 from wrt.renderer.options import Options
+from wrt.renderer.plan import features_of
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material

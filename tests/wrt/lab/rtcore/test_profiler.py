@@ -20,9 +20,8 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.traverse.common import Units
 from wrt.lab.costs import COUNTERS
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
-from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress
-from wrt.renderer.plan import render_kernel
+from wrt.renderer.plan import features_of, render_kernel
 from wrt.scene.model import Scene
 from wrt.scene.shapes import box
 

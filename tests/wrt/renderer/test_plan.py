@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrt.kernels.shade.features import Features
-from wrt.renderer.features import STACK_STEP, describe, features_of, switches
 from wrt.renderer.film import filter_icdf
+from wrt.renderer.plan import STACK_STEP, describe, features_of, switches
 from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
