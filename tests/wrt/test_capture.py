@@ -95,13 +95,11 @@ METHODS: dict[str, Call] = {
     "OneMesh.closest_hit": lambda s: s.accel.closest_hit(*s.warp, out=s.out),
     "OneMesh.any_hit": lambda s: s.accel.any_hit(*s.rays),
     "OneMesh.refit": lambda s: s.bvh2.refit(s.larger),
-    "OneMesh.epo": lambda s: s.bvh2.epo(),
     "OneMesh.save": lambda s: s.bvh2.save(s.folder / "new.accel"),
     "OneMesh.snapshot": lambda s: s.bvh2.snapshot,
     "Instances.closest_hit": lambda s: s.instances.closest_hit(*s.warp),
     "Instances.any_hit": lambda s: s.instances.any_hit(*s.warp),
     "Instances.move": lambda s: s.instances.move(0, np.diag([2.0, 2.0, 2.0, 1.0])),
-    "Instances.save": lambda s: s.instances.save(s.folder / "new.accel"),
     "Instances.snapshot": lambda s: s.instances.snapshot,
     **{f"Hits.{name}": partial(lambda s, name: getattr(s.hits_of_instances if name == "instance" else s.hits, name), name=name)
        for name in OF_HITS},
@@ -145,7 +143,7 @@ AT_ONCE |= {f"{kind}.{name}" for kind, names in {
     "Sensor": "picture rays",
     "sensors": "LIDARS LidarModel Sensor"}.items() for name in names.split()}
 CALLS = FUNCTIONS | METHODS | OTHERS
-AT_ONCE_ON_GPU = {"camera_rays", "Instances.save"}  # arrays of the host in and out
+AT_ONCE_ON_GPU = {"camera_rays"}  # arrays of the host in and out
 # Calls that a graph of a GPU captures.
 ON_GPU = {"visible", "OneMesh.closest_hit", "OneMesh.snapshot", "Instances.snapshot", "Instances.any_hit", "Instances.closest_hit",
           "refit of Warp arrays", "Hits.point", "Hits.points", "Hits.point_error", "Hits.normal", "Hits.normals", "Hits.shading_normal",

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.box_tree import BoxTree, end_point_overlap, nested
+from wrt.accel.box_tree import BoxTree, nested
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
@@ -193,19 +193,6 @@ class OneMesh(Accelerator, ABC):
     def _built_of(self, tree: BoxTree) -> Built:
         """Convert a tree, whose boxes contain the padded primitives."""
         raise InputError(f"a {self.name} cannot be made from a tree of boxes", argument="accel", hint="use a BVH")
-
-    def epo(self) -> float:
-        """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
-
-        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines. A node and a primitive
-        cost 1 each.
-
-        Raises
-        ------
-        InputError
-            If the structure is not a BVH.
-        """
-        return end_point_overlap(self._box_tree(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
         return uploaded(self.structure, built, self._primitives(built), self.device)

@@ -8,17 +8,14 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.core.checks import as_path, shown
-from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
 from wrt.core.files import require_file, write_bytes
 from wrt.core.types import PathLike
 
 MOST_CHILDREN = 8
-TRIANGLES_PER_LAUNCH = 16384
 MAX_LEAF = 64  # primitives
 ABSENT, INNER = -1, 0  # values of `count` for a child that does not exist, and for an inner node
 
@@ -100,157 +97,69 @@ class BoxTree:
         """Return the indices of the nodes of each level, the root first."""
         out = [np.zeros(1, np.int64)]
         while len(below := self.child[out[-1]][self.count[out[-1]] == INNER]):
-            out.append(below.astype(np.int64))
-            if len(out) > len(self.child):
-                break
+            out.append(below)
         return out
 
     def checked(self, geometry: Geometry, spatial_splits: bool = False) -> BoxTree:
-        """Return the tree with boxes that contain the padded boxes of its primitives, or raise InputError if it is not a tree of them."""
-        check_links(self)
-        check_primitives(self, len(geometry), spatial_splits)
-        check_boxes(self, geometry, spatial_splits)
-        absent = (self.count == ABSENT)[..., None]
-        tree = replace(self, lo=np.where(absent, np.float32(np.inf), self.lo), hi=np.where(absent, np.float32(-np.inf), self.hi))
-        return tree if spatial_splits else grown(tree, geometry)
+        """Return the tree in depth-first order, with boxes that contain the padded boxes of its primitives, so that no ray is lost.
 
-    @property
-    def in_order(self) -> bool:
-        """Whether every child comes after its parent, and `primitives` has the leaves without gaps."""
-        leaf, inner = self.count > 0, self.count == INNER
-        after = (self.child > np.arange(len(self.child))[:, None])[inner].all()
-        first, count = self.child[leaf], self.count[leaf]
-        by_first = np.argsort(first, kind="stable")
-        ends = np.cumsum(count[by_first])
-        return bool(after and np.array_equal(first[by_first], ends - count[by_first]) and ends[-1:].sum() == len(self.primitives))
+        After spatial splits, the boxes of leaves stay as they are. Raises InputError if the arrays are no tree over the geometry.
+        """
+        tree, n = self.depth_first(), len(geometry)
+        if ((tree.primitives < 0) | (tree.primitives >= n)).any():
+            raise InputError(f"must be prim_ids, 0 to {n - 1}", place="tree: primitives")
+        times = np.bincount(tree.primitives, minlength=n)
+        if (wrong := (times != 1) & ((times == 0) | (not spatial_splits))).any():
+            i = int(np.argmax(wrong))
+            raise InputError(f"is in the leaves {times[i]} times", place=f"tree: primitive {i}",
+                             hint="pass spatial_splits=True if the builder splits primitives" if times[i] else None)
+        absent = (tree.count == ABSENT)[..., None]
+        lo, hi = np.where(absent, np.float32(np.inf), tree.lo), np.where(absent, np.float32(-np.inf), tree.hi)
+        require(~np.isnan(np.concatenate([lo, hi], axis=2)).any(axis=2), "the box has a NaN")
+        if not spatial_splits:
+            leaf = np.flatnonzero(tree.count > 0)
+            leaf = leaf[np.argsort(tree.child.flat[leaf])]  # in the order of their primitives
+            owner, bounds = np.repeat(leaf, tree.count.flat[leaf]), geometry.bounds()
+            np.minimum.at(lo.reshape(-1, 3), owner, bounds[0][tree.primitives])
+            np.maximum.at(hi.reshape(-1, 3), owner, bounds[1][tree.primitives])
+        return nested(replace(tree, lo=lo, hi=hi))
 
-    def preorder(self) -> BoxTree:
-        """Return the tree with its nodes and primitives in depth-first order."""
-        levels, inner, n = self.levels(), self.count == INNER, len(self.child)
-        nodes, held = np.ones(n, np.int64), np.zeros(n, np.int64)  # nodes and primitives of each subtree
-        sizes = [np.zeros((n, self.width), np.int64), np.maximum(self.count, 0)]
-        for level in reversed(levels):
-            at = np.where(inner[level], self.child[level], 0)
-            sizes[0][level] = np.where(inner[level], nodes[at], 0)
-            sizes[1][level] = np.where(inner[level], held[at], sizes[1][level])
-            nodes[level] = 1 + sizes[0][level].sum(axis=1)
-            held[level] = sizes[1][level].sum(axis=1)
-        index, first = np.zeros(n, np.int64), np.zeros((n, self.width), np.int64)
-        begin = np.zeros(n, np.int64)  # first primitive of each subtree
-        for level in levels:
-            before = [np.cumsum(size[level], axis=1) - size[level] for size in sizes]
-            first[level] = begin[level][:, None] + before[1]
-            mask = inner[level]
-            index[self.child[level][mask]] = (index[level][:, None] + 1 + before[0])[mask]
-            begin[self.child[level][mask]] = first[level][mask]
-        old = np.argsort(index)
-        child = np.where(inner, index[np.where(inner, self.child, 0)], np.where(self.count > 0, first, 0))
-        out = replace(self, lo=self.lo[old], hi=self.hi[old], child=child[old], count=self.count[old])
-        leaf = self.count[old] > 0
-        source, target, count = self.child[old][leaf], out.child[leaf], out.count[leaf]
-        within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-        primitives = np.zeros(len(within), np.int64)
-        primitives[np.repeat(target, count) + within] = self.primitives[np.repeat(source, count) + within]
-        return replace(out, primitives=primitives)
+    def depth_first(self) -> BoxTree:
+        """Return the tree with its nodes and primitives in depth-first order. Raises InputError if the links form no tree."""
+        (n, width), size, inner = self.child.shape, len(self.primitives), self.count == INNER
+        within = (self.child >= 0) & (self.child + self.count <= size)
+        require((self.count >= ABSENT) & (self.count <= MAX_LEAF), f"`count` must be -1 (none), 0 (inner node) or 1 to {MAX_LEAF} (leaf)")
+        require(~inner | ((self.child > 0) & (self.child < n)), f"`child` must be a node, 1 to {n - 1}")
+        require((self.count < 1) | within, f"the leaf leads beyond `primitives`, which has {size}")
+        child, count = self.child.reshape(-1).tolist(), self.count.reshape(-1).tolist()
+        nodes: list[int] = []
+        leaves: list[int] = []  # as places in `child`
+        met, places = np.zeros(n, bool), [-1]
+        while places:
+            place = places.pop()
+            if place >= 0 and count[place] > 0:
+                leaves.append(place)
+                continue
+            node = 0 if place < 0 else child[place]
+            if met[node]:
+                raise InputError("is the child of two nodes, or below itself", place=f"tree: node {node}")
+            met[node] = True
+            nodes.append(node)
+            places += [each for each in range((node + 1) * width - 1, node * width - 1, -1) if count[each] != ABSENT]
+        if not met.all():
+            raise InputError("is not reached from node 0, the root", place=f"tree: node {int(np.argmin(met))}")
+        counts, links = self.count.flat[leaves], np.where(inner, np.argsort(nodes)[np.where(inner, self.child, 0)], 0)
+        before = np.cumsum(counts) - counts
+        links.flat[leaves] = before
+        source = np.repeat(self.child.flat[leaves] - before, counts) + np.arange(counts.sum())
+        return BoxTree(self.lo[nodes], self.hi[nodes], links[nodes], self.count[nodes], self.primitives[source])
 
 
-def require(good: np.ndarray, what: str, found: np.ndarray | None = None) -> None:
-    """Raise InputError at the first node and child where `good`, (N, W) bool, is False. found: (N, W), values for the message."""
+def require(good: np.ndarray, what: str) -> None:
+    """Raise InputError at the first node and child where `good`, (N, W) bool, is False."""
     if not good.all():
         node, k = map(int, np.argwhere(~good)[0])
-        got = "" if found is None else f", got {found[node, k]}"
-        raise InputError(what + got, place=f"tree: node {node}, child {k}")
-
-
-def check_links(tree: BoxTree) -> None:
-    """Raise InputError unless every node but the root is the child of one node, and can be reached from the root."""
-    child, count, n = tree.child, tree.count, len(tree.child)
-    inner = count == INNER
-    require((count >= ABSENT) & (count <= MAX_LEAF), f"`count` must be -1 (no child), 0 (inner node) or 1 to {MAX_LEAF} (leaf)", count)
-    require(~inner | ((child >= 0) & (child < n)), f"`child` must be a node, 0 to {n - 1}", child)
-    require(~inner | (child != 0), "leads to node 0, the root, which has no parent")
-    if n > 1 and (count == ABSENT).all(axis=1).any():
-        raise InputError("has no child", place=f"tree: node {int(np.flatnonzero((count == ABSENT).all(axis=1))[0])}")
-    parents = np.bincount(child[inner], minlength=n)
-    if (parents > 1).any():
-        raise InputError("is the child of two nodes or more", place=f"tree: node {int(np.argmax(parents > 1))}")
-    if (parents[1:] == 0).any():
-        raise InputError("is no node's child, and is not the root, node 0", place=f"tree: node {1 + int(np.argmax(parents[1:] == 0))}")
-    reached = np.zeros(n, bool)
-    reached[np.concatenate(tree.levels())] = True
-    if not reached.all():
-        raise InputError("is part of a cycle, which the root does not reach", place=f"tree: node {int(np.argmin(reached))}")
-
-
-def check_primitives(tree: BoxTree, n: int, spatial_splits: bool) -> None:
-    """Raise InputError unless the leaves hold each of n primitives, once unless `spatial_splits`."""
-    leaf, size = tree.count > 0, len(tree.primitives)
-    require(~leaf | ((tree.child >= 0) & (tree.child + tree.count <= size)), f"the leaf leaves `primitives`, which has {size}", tree.child)
-    wrong = (tree.primitives < 0) | (tree.primitives >= n)
-    if wrong.any():
-        i = int(np.argmax(wrong))
-        raise InputError(f"must be a prim_id, 0 to {n - 1}, got {tree.primitives[i]}", place=f"tree: primitives[{i}]")
-    first, count = tree.child[leaf], tree.count[leaf]
-    uses = np.zeros(size + 1, np.int64)
-    np.add.at(uses, first, 1)
-    np.add.at(uses, first + count, -1)
-    uses = np.cumsum(uses)[:size]
-    if (uses > 1).any():
-        raise InputError("is in two leaves", place=f"tree: primitives[{int(np.argmax(uses > 1))}]")
-    if (uses < 1).any():
-        raise InputError("is in no leaf", place=f"tree: primitives[{int(np.argmax(uses < 1))}]")
-    times = np.bincount(tree.primitives, minlength=n)
-    if (times == 0).any():
-        raise InputError("is in no leaf", place=f"tree: primitive {int(np.argmax(times == 0))}")
-    if (times > 1).any() and not spatial_splits:
-        raise InputError(f"is in the leaves {times.max()} times", place=f"tree: primitive {int(np.argmax(times > 1))}",
-                         hint="pass spatial_splits=True if the builder splits primitives")
-
-
-def check_boxes(tree: BoxTree, geometry: Geometry, spatial_splits: bool) -> None:
-    """Raise InputError unless each box contains the boxes of its children, or the primitives of its leaf."""
-    exists, leaf, inner = tree.count != ABSENT, tree.count > 0, tree.count == INNER
-    nan = np.isnan(tree.lo).any(axis=2) | np.isnan(tree.hi).any(axis=2)
-    require(~exists | ~nan, "the box has a NaN")
-    require(~exists | (tree.lo <= tree.hi).all(axis=2), "the box is empty: lo is above hi")
-    low = np.where(exists[..., None], tree.lo, np.inf).min(axis=1)
-    high = np.where(exists[..., None], tree.hi, -np.inf).max(axis=1)
-    at = np.where(inner, tree.child, 0)
-    fits = ((tree.lo <= low[at]) & (tree.hi >= high[at])).all(axis=2)
-    require(~inner | fits, "the box does not contain the boxes of its node's children")
-    lo, hi = geometry.bounds() if spatial_splits else bare_bounds(geometry)
-    low, high = leaf_bounds(tree, lo, hi)
-    if spatial_splits:
-        held = (tree.lo <= high).all(axis=2) & (tree.hi >= low).all(axis=2)
-        require(~leaf | held, "the box of the leaf does not meet its primitives")
-    else:
-        require(~leaf | ((tree.lo <= low) & (tree.hi >= high)).all(axis=2), "the box of the leaf does not contain its primitives")
-
-
-def bare_bounds(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box of every primitive without padding: low and high, (N, 3) float32."""
-    corners, spheres = geometry.vertices[geometry.faces], geometry.spheres
-    return (np.concatenate([corners.min(axis=1), spheres[:, :3] - spheres[:, 3:]]),
-            np.concatenate([corners.max(axis=1), spheres[:, :3] + spheres[:, 3:]]))
-
-
-def leaf_bounds(tree: BoxTree, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box around the primitives of each leaf, (N, W, 3) each; empty where there is no leaf. lo, hi: of all primitives."""
-    leaf = tree.count > 0
-    low, high = np.full(tree.lo.shape, np.inf, np.float32), np.full(tree.lo.shape, -np.inf, np.float32)
-    owner = np.repeat(np.flatnonzero(leaf.reshape(-1)), tree.count[leaf])
-    count = tree.count[leaf]
-    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    prim_id = tree.primitives[np.repeat(tree.child[leaf], count) + within]
-    np.minimum.at(low.reshape(-1, 3), owner, lo[prim_id])
-    np.maximum.at(high.reshape(-1, 3), owner, hi[prim_id])
-    return low, high
-
-
-def grown(tree: BoxTree, geometry: Geometry) -> BoxTree:
-    """Return the tree with boxes that also contain the padded boxes of the primitives, so that rounding loses no ray."""
-    low, high = leaf_bounds(tree, *geometry.bounds())
-    return nested(replace(tree, lo=np.minimum(tree.lo, low), hi=np.maximum(tree.hi, high)))
+        raise InputError(what, place=f"tree: node {node}, child {k}")
 
 
 def nested(tree: BoxTree) -> BoxTree:
@@ -262,30 +171,3 @@ def nested(tree: BoxTree) -> BoxTree:
         lo[level] = np.where(mask, np.minimum(lo[level], lo[at].min(axis=2)), lo[level])
         hi[level] = np.where(mask, np.maximum(hi[level], hi[at].max(axis=2)), hi[level])
     return replace(tree, lo=lo, hi=hi)
-
-
-def end_point_overlap(tree: BoxTree, geometry: Geometry, threads: int) -> float:
-    """Compute the end-point overlap of a BVH, at cost 1 per node and 1 per primitive; 0 without any area.
-
-    The source is Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies", equation 2. It sums over all nodes:
-    cost times the fraction of the surface that is in the node's box, but not in its subtree. Only finite triangles have surface. A
-    triangle with several references is in several subtrees.
-    """
-    from wrt.kernels.build import end_point_overlap as kernels  # not at the top, because a start does not need it
-
-    cpu, n = start("cpu"), len(geometry.faces)
-    corners = geometry.vertices[geometry.faces].astype(np.float64)
-    finite = np.isfinite(corners).all(axis=(1, 2))
-    corners = corners[finite]
-    surface = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    if not surface > 0.0:
-        return 0.0
-    of_tree = kernels.Children()
-    of_tree.width = tree.width
-    of_tree.lo, of_tree.hi = (upload(array.reshape(-1, 3), wp.vec3, cpu) for array in (tree.lo, tree.hi))
-    of_tree.first, of_tree.count, of_tree.order = (upload(array.reshape(-1), wp.int32, cpu)
-                                                   for array in (tree.child, tree.count, tree.primitives))
-    vertices, faces = upload(geometry.vertices, wp.vec3, cpu), upload(geometry.faces, wp.vec3i, cpu)
-    out = wp.zeros(n, dtype=wp.float64, device=cpu)
-    launch(kernels.end_point_overlap, n, of_tree, vertices, faces, None, out, threads=threads, step=TRIANGLES_PER_LAUNCH)
-    return float(out.numpy()[finite].sum() / surface)

@@ -16,7 +16,6 @@ from wrt.accel.geometry import MAX_SPREAD, InstancedGeometry, inverse_of, spread
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.snapshot import AccelStats, Refit, Structure
-from wrt.accel.store import save_instances
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, widen, world_boxes
 from wrt.core.arrays import real_numbers, to_warp
 from wrt.core.building import build_clock
@@ -24,7 +23,7 @@ from wrt.core.checks import shown, unknown
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.core.types import ArrayLike, PathLike, WarpStruct
+from wrt.core.types import ArrayLike, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
@@ -57,8 +56,6 @@ class Instances(Accelerator):
         self, begin, units = cls.__new__(cls), build_clock(), bottoms[0].structure.units
         Accelerator.__init__(self, Structure(type(bottoms[0]), units._replace(instances=True)), geometry, attributes, device, threads)
         self._place(bottoms, geometry, begin)
-        if not within_reach(self._top.low, self._top.high, 2.0 * MAX_REACH):  # a saved box's pad may pass MAX_REACH
-            raise InputError(f"is damaged: an instance is farther than {MAX_REACH:g} from the origin")
         return self
 
     def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float) -> None:
@@ -168,7 +165,7 @@ class Instances(Accelerator):
         if "boxes" not in self._cache:
             self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
         low, high = world_boxes(geometry, rows, self._cache["boxes"])
-        if not within_reach(low, high, MAX_REACH):
+        if not ((np.maximum(np.abs(low), np.abs(high)) <= MAX_REACH) | (low > high)).all():
             raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
         if geometry.origin is None and not (np.maximum(-low, high) > 0.5 * FAR * (high - low).max(axis=1, keepdims=True)).any():
             return geometry, rows, low, high
@@ -199,31 +196,11 @@ class Instances(Accelerator):
         """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""
         return Instances.restore, (self.bottoms, self.geometry, self._snapshot.attributes, str(self.device), self.threads)
 
-    def save(self, path: PathLike) -> None:
-        """Write the structure and its scene to a file that `wrt.load_accel(path)` reads. Of materials, the file has only indices.
-
-        Parameters
-        ----------
-        path : str or path
-            File with the suffix .accel.
-
-        Raises
-        ------
-        InputError
-            If the suffix is not .accel, or the file cannot be written.
-        """
-        save_instances(self.snapshot, [bottom.built for bottom in self.bottoms], path)
-
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry
         assert isinstance(geometry, InstancedGeometry)
         return (f"Instances({len(geometry)} primitives in {len(geometry.part)} instances of "
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
-
-
-def within_reach(low: np.ndarray, high: np.ndarray, reach: float) -> bool:
-    """Return whether all coordinates of the boxes are at most `reach`. low, high: (R, 3); boxes with low > high are empty."""
-    return bool(((np.maximum(np.abs(low), np.abs(high)) <= reach) | (low > high)).all())
 
 
 def is_named(instance: object) -> TypeGuard[str | list[str]]:

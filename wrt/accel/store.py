@@ -1,8 +1,8 @@
-"""Files of structures, which `wrt build` writes and `wrt.load_accel` reads: archives of NumPy arrays (.npz) with the suffix .accel.
+"""Files of structures over one mesh, which `wrt build` writes and `wrt.load_accel` reads: .npz archives with the suffix .accel.
 
-An array `header` is the version, the class and the statistics as JSON. The arrays "0.nodes", "0.order" ... are those of the first
-structure; files of instances have several. The scene's arrays (wrt.accel.scene_arrays) are "scene.vertices" ...; without them, the
-header has a checksum of the geometry. Nothing is unpickled, and all indices are checked before a ray follows them.
+An array `header` is the version, the class and the statistics as JSON; `order` and the arrays of the structure's Warp struct follow.
+The arrays "mesh.vertices" ... hold the mesh; without them, the header has a checksum of it. Nothing is unpickled, and all indices are
+checked before a ray follows them.
 """
 
 import json
@@ -11,16 +11,15 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.flat_scene import FlatScene
-from wrt.accel.geometry import Geometry, InstancedGeometry
-from wrt.accel.scene_arrays import KINDS, arrays_of, scene_of
+from wrt.accel.flat_scene import FlatScene, flat_scene_of
+from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built, Snapshot, Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_one
@@ -28,23 +27,26 @@ from wrt.core.device import empty_aligned, row_type
 from wrt.core.errors import InputError, at
 from wrt.core.files import check_writable, read_file, replacing
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.core.types import PathLike
+from wrt.core.types import PathLike, WarpType
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
-VERSION = 3
+VERSION = 4
 STATS = ("nodes", "leaves", "depth", "sah_cost")
-SCENE = "scene."
+MESH = "mesh."
+# Type and shape of a row of each array of a mesh with its attributes; all but the last three must be there.
+MESH_TYPES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "vertices": ("<f4", (3,)), "faces": ("<i4", (3,)), "spheres": ("<f4", (4,)), "uvs": ("<f4", (2,)), "prim_material": ("<i4", ()),
+    "normals": ("<f4", (3,)), "objects": ("<i8", ()), "origin": ("<f8", ())}
 # The head of an array. NumPy parses it as Python, and two threads that parse at once make CPython 3.11 raise SystemError.
 NPY, MAGIC = struct.Struct("<8sH"), b"\x93NUMPY\x01\x00"
 HEADER = re.compile(r"\{'descr': '([<|][A-Za-z][0-9]{1,9})', 'fortran_order': False, 'shape': \(([0-9, ]*)\), \}\s*")
 
 
-def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype]:
-    """Return the NumPy type of one row of each array in Built.arrays, by the name of the array."""
-    kinds = fields_of(Structure(accel, Units(triangle)).struct())
-    return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
-            if name not in ("primitives", "recorder")}
+def array_types(accel: type[Any], units: Units) -> dict[str, WarpType]:
+    """Return the type of each entry of Built.arrays, by its name."""
+    kinds = fields_of(Structure(accel, units._replace(instances=False)).struct())
+    return {name: kind for name, kind in kinds.items() if name not in ("primitives", "recorder")}
 
 
 def check_target(path: PathLike) -> None:
@@ -56,26 +58,20 @@ def check_target(path: PathLike) -> None:
 
 def save(snapshot: Snapshot, path: PathLike, mesh: bool = False) -> None:
     """Write a structure over one mesh to a file atomically; mesh: with the mesh. Raises InputError if the file cannot be written."""
-    _write(snapshot, [snapshot.arrays.on_host()], path, as_one(mesh, bool, "mesh"), geometry=snapshot.mesh.checksum())
-
-
-def save_instances(snapshot: Snapshot, bottoms: Sequence[Built], path: PathLike) -> None:
-    """Write a structure over instances to a file atomically, with its scene; bottoms: of the structures of the lower level."""
-    _write(snapshot, bottoms, path, True)
-
-
-def _write(snapshot: Snapshot, parts: Sequence[Built], path: PathLike, scene: bool, **more: object) -> None:
     check_target(path)
-    structure = snapshot.structure
-    header = {"version": VERSION, "accel": structure.accel.name, "triangle": structure.units.triangle, "box": structure.units.box,
-              "instances": structure.units.instances, "parts": [[getattr(part, name) for name in STATS] for part in parts], **more}
-    arrays: dict[str, Any] = {"header": np.array(json.dumps(header))}
-    arrays |= {f"{SCENE}{name}": array for name, array in arrays_of(snapshot).items()} if scene else {}
-    for i, part in enumerate(parts):
-        for name, kind in array_types(structure.accel, structure.units.triangle).items():
-            rows = np.ascontiguousarray(np.atleast_1d(part.arrays[name])).astype(kind.base, copy=False)
-            arrays[f"{i}.{name}"] = rows.reshape(-1).view(np.uint8)
-        arrays[f"{i}.order"] = part.order
+    (accel, units), built, geometry = snapshot.structure, snapshot.arrays.on_host(), snapshot.mesh
+    header = {"version": VERSION, "accel": accel.name, "triangle": units.triangle, "box": units.box, "geometry": geometry.checksum(),
+              "stats": [getattr(built, name) for name in STATS]}
+    arrays: dict[str, Any] = {"header": np.array(json.dumps(header)), "order": built.order}
+    for name, kind in array_types(accel, units).items():
+        row = row_type(kind.dtype if isinstance(kind, wp.array) else kind)
+        arrays[name] = np.ascontiguousarray(built.arrays[name]).astype(row.base, copy=False).reshape(-1).view(np.uint8)
+    if as_one(mesh, bool, "mesh"):
+        scene = snapshot.attributes or flat_scene_of(geometry)
+        for name, (dtype, shape) in MESH_TYPES.items():
+            array = getattr(geometry if name in ("vertices", "spheres", "origin") else scene, name)
+            if array is not None:
+                arrays[MESH + name] = np.ascontiguousarray(array, dtype).reshape(-1, *shape)
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -106,8 +102,8 @@ def read_arrays(path: PathLike) -> dict[str, np.ndarray]:
 
 
 def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None = None, device: str = DEFAULT_DEVICE,
-         threads: int | None = None, place: Callable[..., Any] | None = None) -> Any:
-    """Read a structure over `geometry`; None: over the scene in the file. place: `Instances.restore`, for files of instances.
+         threads: int | None = None) -> Any:
+    """Read a structure over `geometry`; None: over the mesh in the file.
 
     Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
@@ -115,57 +111,53 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
         read_file(path, 1)  # refuses pipes and devices
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
-                return _restored(read_arrays(path), geometry, attributes, device, threads, place)
-        except InputError:
+                return _restored(read_arrays(path), geometry, attributes, device, threads)
+        except (InputError, MemoryError):
             raise
         except Exception as error:  # zipfile, zlib, NumPy and json raise many kinds
-            if isinstance(error, MemoryError):
-                raise
             raise InputError(f"is damaged, or not a structure of this version of wrt ({type(error).__name__}: {error})") from error
 
 
 def _restored(arrays: dict[str, np.ndarray], geometry: Geometry | None, attributes: FlatScene | None, device: str,
-              threads: int | None, place: Callable[..., Any] | None) -> Any:
+              threads: int | None) -> Any:
     """Make the structure of a file's arrays, as `read` does."""
-    header = json.loads(str(arrays.pop("header")))
+    header = json.loads(str(arrays["header"]))
     if header["version"] != VERSION:
         raise ValueError("another version")
-    cls, units = ACCELERATORS.get(header["accel"]), Units(header["triangle"], header["box"])
+    cls, units, order = ACCELERATORS.get(header["accel"]), Units(header["triangle"], header["box"]), arrays["order"]
     if cls is None:
         raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
-    parts = [_part(cls, units, arrays, i, *stats) for i, stats in enumerate(header["parts"])]
-    in_file = {name.removeprefix(SCENE): array for name, array in arrays.items() if name.startswith(SCENE)}
-    if any(array.dtype != KINDS[name][0] for name, array in in_file.items()):
-        raise ValueError("an array of another type")
-    if header["instances"] and (geometry is not None or place is None):
-        raise InputError("must not be given: the file holds instances with their scene", argument="mesh")
+    if order.dtype != np.int32 or order.ndim != 1:
+        raise ValueError("an order of another type")
+    rows = {}
+    for name, kind in array_types(cls, units).items():
+        row = row_type(kind.dtype if isinstance(kind, wp.array) else kind)
+        rows[name] = arrays[name].view(row.base).reshape((-1, *row.shape) if isinstance(kind, wp.array) else row.shape)
+    nodes, leaves, depth, sah_cost = header["stats"]
+    built = Built(rows, order, int(nodes), int(leaves), int(depth), float(sah_cost))
     if geometry is None:
-        if not in_file:
-            raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
-        attributes = scene_of(in_file)
-        if isinstance(attributes.geometry, InstancedGeometry) != bool(header["instances"]):
-            raise ValueError("a scene of another kind")
-        if isinstance(attributes.geometry, InstancedGeometry):
-            assert place is not None
-            bottoms = [cls.restore(built, part, None, device, threads, units=units)
-                       for built, part in zip(parts, attributes.geometry.parts, strict=True)]
-            return place(bottoms, attributes.geometry, attributes, device, threads)
+        attributes = _mesh_of(arrays)
+        assert isinstance(attributes.geometry, Geometry)
         geometry = attributes.geometry
     if header["geometry"] != geometry.checksum():
         raise InputError("was built over another mesh")
-    (built,) = parts
     return cls.restore(built, geometry, attributes, device, threads, units=units)
 
 
-def _part(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], i: int, nodes: int, leaves: int, depth: int,
-          sah_cost: float) -> Built:
-    """Return the arrays and statistics of structure i of a file."""
-    rows = {name: arrays[f"{i}.{name}"].view(kind.base).reshape((-1, *kind.shape))
-            for name, kind in array_types(cls, units.triangle).items()}
-    order = arrays[f"{i}.order"]
-    if order.dtype != np.int32 or order.ndim != 1:
-        raise ValueError("an order of another type")
-    return Built(rows, order, int(nodes), int(leaves), int(depth), float(sah_cost))
+def _mesh_of(arrays: Mapping[str, np.ndarray]) -> FlatScene:
+    """Make the mesh of a file with its attributes. Raises InputError for indices and lengths that do not fit."""
+    if MESH + "vertices" not in arrays:
+        raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
+    a = {name: arrays[MESH + name] for name in MESH_TYPES if MESH + name in arrays}
+    if any(array.dtype != (kind := MESH_TYPES[name])[0] or array.shape[1:] != kind[1] for name, array in a.items()):
+        raise ValueError("an array of another type")
+    geometry, n, origin = Geometry(a["vertices"], a["faces"], a["spheres"], a.get("origin")), len(a["vertices"]), a.get("origin")
+    first = np.append(a.get("objects", np.zeros(1, np.int64)), len(geometry))
+    if not (((a["faces"] >= 0) & (a["faces"] < n)).all() and len(a["uvs"]) in (0, n) and len(a.get("normals", a["vertices"])) == n
+            and (origin is None or (origin.shape == (3,) and np.isfinite(origin).all())) and (a["prim_material"] >= 0).all()
+            and ("objects" not in a or len(a["prim_material"]) == len(geometry)) and first[0] == 0 and (np.diff(first) >= 0).all()):
+        raise InputError("is damaged: an array of its mesh has a wrong length, or leads beyond another")
+    return FlatScene(geometry, geometry.vertices, geometry.faces, a.get("normals"), a["uvs"], a["prim_material"], objects=a.get("objects"))
 
 
 def check_order(order: np.ndarray, count: int, name: str) -> None:

@@ -84,7 +84,6 @@ def binary_tree_of(tree: BoxTree) -> BinaryTree:
     """Convert a BoxTree of at most two children per node, in depth-first order."""
     if tree.width > 2:
         raise InputError(f"must have at most 2 children per node, got {tree.width}", place="tree: child", hint="use bvh4 or bvh8")
-    tree = tree.preorder()
     nodes = records(Bvh2Node, len(tree.child))
     for side in range(2):
         absent = tree.count[:, side] < 0 if side < tree.width else np.ones(len(nodes), bool)

@@ -99,24 +99,19 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
 
 
 def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
-    """Convert a BoxTree to nodes of `width` children. Missing children come first."""
+    """Convert a BoxTree in depth-first order to nodes of `width` children. Missing children come first."""
     missing = width - tree.width
     if missing < 0:
         raise InputError(f"must have at most {width} children per node, got {tree.width}", place="tree: child", hint="use bvh8")
     if len(tree.primitives) > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} primitives, got {len(tree.primitives)}", hint="use accel='bvh2'")
-    if not tree.in_order:
-        tree = tree.preorder()
     leaf, n = tree.count > 0, len(tree.child)
     children = np.where(leaf, leaf_reference.func(tree.child, np.maximum(tree.count, 1)), np.where(tree.count < 0, EMPTY, tree.child))
     lo, hi = (np.concatenate([np.full((n, missing, 3), end, np.float32), box], axis=1)
               for box, end in ((tree.lo, np.inf), (tree.hi, -np.inf)))
     children = packed(np.concatenate([np.full((n, missing), EMPTY), children], axis=1).astype(np.int32), width)
-    by_first = np.argsort(tree.child[leaf], kind="stable")
-    first, count = tree.child[leaf][by_first], tree.count[leaf][by_first]
-    within = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    order = tree.primitives[np.repeat(first, count) + within].astype(np.int32)
-    return WideTree(lo, hi, children, lanes_of(children, order, width), int(leaf.sum()), len(tree.levels()), stack_need(children))
+    lanes = lanes_of(children, tree.primitives.astype(np.int32), width)
+    return WideTree(lo, hi, children, lanes, int(leaf.sum()), len(tree.levels()), stack_need(children))
 
 
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:

@@ -39,14 +39,6 @@ from wrt.scene.values import warn_if_far
 if TYPE_CHECKING:
     import trimesh
 
-    from wrt.accel.brute_force import BruteForce
-    from wrt.accel.bvh.binary import Bvh2
-    from wrt.accel.bvh.six import Bvh6
-    from wrt.accel.bvh.volumes import Bvh2Kdop, Bvh2Sphere
-    from wrt.accel.bvh.wide import Bvh4, Bvh8, Bvh8c
-    from wrt.accel.cells.grid import Grid
-    from wrt.accel.cells.trees import Bsp, KdTree, Octree
-
     OneMeshLike: TypeAlias = Mesh | Geometry | trimesh.Trimesh | wp.Mesh | tuple[ArrayLike, ArrayLike]
     SceneLike: TypeAlias = Scene | InstancedGeometry | trimesh.Scene | PathLike
     MeshLike: TypeAlias = OneMeshLike | SceneLike
@@ -84,43 +76,7 @@ class BuildOptions(TypedDict, total=False):
 
 
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh4: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh6: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8c: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Sphere: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Kdop: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> KdTree: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bsp: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> BruteForce: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["grid"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Grid: ...
-@overload
-def build(mesh: OneMeshLike, accel: Literal["octree"], device: str | None = ..., threads: int | None = ...,
-          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Octree: ...
-@overload
-def build(mesh: OneMeshLike, accel: str, device: str | None = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: str = ..., device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
 def build(mesh: MeshLike, accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: Literal[True],
@@ -187,13 +143,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
     return built
 
 
-@overload
-def load_accel(path: PathLike, mesh: MeshLike, device: str | None = ..., threads: int | None = ...) -> OneMesh: ...
-@overload
-def load_accel(path: PathLike, mesh: None = ..., device: str | None = ..., threads: int | None = ...) -> OneMesh | Instances: ...
-def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None = None,
-               threads: int | None = None) -> OneMesh | Instances:
-    """Read a structure that `OneMesh.save`, `Instances.save` or `wrt build` wrote.
+def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None = None, threads: int | None = None) -> OneMesh:
+    """Read a structure that `OneMesh.save` or `wrt build` wrote.
 
     Parameters
     ----------
@@ -204,7 +155,7 @@ def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None 
 
     Returns
     -------
-    OneMesh or Instances
+    OneMesh
         Structure with the same intersection tests as the saved one.
 
     Raises
@@ -212,13 +163,9 @@ def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None 
     InputError
         If the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
-    if mesh is None:
-        loaded: OneMesh | Instances = read(path, None, None, device_of(mesh, device), threads, Instances.restore)
-        return loaded
-    flat = to_flat_scene(mesh)
-    if not isinstance(flat.geometry, Geometry):
-        raise InputError("must not be a scene with instances: the file of a structure over it holds the scene", argument="mesh")
-    return read(path, flat.geometry, flat, device_of(mesh, device), threads)
+    geometry, flat = (None, None) if mesh is None else one_mesh(mesh)
+    loaded: OneMesh = read(path, geometry, flat, device_of(mesh, device), threads)
+    return loaded
 
 
 def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str | None = None,
@@ -251,12 +198,10 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
     InputError
         Says what is wrong and names the node and child, if the arrays are not a tree over the mesh.
     """
-    read, flat = BoxTree.of(tree), to_flat_scene(mesh)
-    if not isinstance(flat.geometry, Geometry):
-        raise InputError("must not be a scene with instances", argument="mesh")
-    name = accel or ("bvh2" if read.width <= 2 else "bvh4" if read.width <= 4 else "bvh8")
+    boxes, (geometry, flat) = BoxTree.of(tree), one_mesh(mesh)
+    name = accel or ("bvh2" if boxes.width <= 2 else "bvh4" if boxes.width <= 4 else "bvh8")
     ACCELERATORS.check(as_one(name, str, "accel"), "accel")
-    return from_tree(ACCELERATORS[name], read, flat.geometry, flat, device_of(mesh, device), threads, spatial_splits)
+    return from_tree(ACCELERATORS[name], boxes, geometry, flat, device_of(mesh, device), threads, spatial_splits)
 
 
 def device_of(mesh: Any, device: str | None) -> str:
@@ -273,6 +218,14 @@ def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
     if isinstance(geometry, DeviceGeometry):
         return DeviceGeometry.unchecked(wp.clone(geometry.points), wp.clone(geometry.indices), geometry.spheres.copy())
     return deepcopy(geometry)
+
+
+def one_mesh(mesh: MeshLike) -> tuple[Geometry, FlatScene]:
+    """Convert as `to_flat_scene` does. Raises InputError for a scene with instances."""
+    flat = to_flat_scene(mesh)
+    if not isinstance(flat.geometry, Geometry):
+        raise InputError("must not be a scene with instances", argument="mesh")
+    return flat.geometry, flat
 
 
 def to_flat_scene(mesh: MeshLike) -> FlatScene:

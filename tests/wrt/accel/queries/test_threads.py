@@ -20,7 +20,6 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build, load_accel
-from wrt.accel.store import array_types
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import load_kernel, made_once, start
 from wrt.core.errors import InputError
@@ -208,20 +207,6 @@ def test_refits_come_one_after_another_and_what_is_saved_is_whole(tmp_path: Any,
     assert len(growths) == 60 and all(growth == costs[which] for which, growth in growths)
     now = accel.snapshot
     assert now.stats.sah_cost == now.built.sah_cost and now.geometry is accel.geometry
-
-
-def test_a_file_that_a_refit_comes_into_holds_one_shape(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    accel, path = build(BALL, "bvh2"), tmp_path / "ball.accel"
-    nodes = accel.built.arrays["nodes"].tobytes()
-
-    def types_and_refit(*arguments: Any) -> Any:
-        accel.refit(SHAPES[1])
-        return array_types(*arguments)
-
-    monkeypatch.setattr("wrt.accel.store.array_types", types_and_refit)
-    accel.save(path)
-    monkeypatch.undo()
-    assert load_accel(path, BALL).built.arrays["nodes"].tobytes() == nodes != accel.built.arrays["nodes"].tobytes()
 
 
 def test_instances_stay_where_they_were_when_their_structure_is_refitted() -> None:
