@@ -170,7 +170,7 @@ def each(paths: list[Path]) -> Callable[[Callable[[Path], None]], Callable[[], N
 
 
 def folder(name: str, below: str) -> str:
-    """Return the name after the prefix `below`: "accel" for wrt.accel.bvh.tree below wrt."""
+    """Return the name after the prefix `below`: "accel" for wrt.accel.bvh.builders below wrt."""
     rest = name.removeprefix(below).strip(".")
     return rest.split(".")[0]
 

@@ -203,8 +203,7 @@ def best_across(work: CellWork, cell: Cell, options: CellOptions, limit: wp.floa
 @wp.func
 def choose_axis(shapes: Shapes, work: CellWork, cell: Cell, options: CellOptions) -> Split:
     """Choose the split of a cell of a k-d tree."""
-    best = best_across(work, cell, options, wp.where(options.by_cost != 0, options.cost_intersection * wp.float64(cell.count),
-                                                     wp.float64(wp.inf)))
+    best = best_across(work, cell, options, options.cost_intersection * wp.float64(cell.count))
     return marked(shapes, work, cell, best)
 
 

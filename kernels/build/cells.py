@@ -42,7 +42,7 @@ class CellOptions:
 
     max_leaf: int
     max_depth: int
-    by_cost: int  # 1: a cell becomes a leaf if no split costs less than the leaf.
+    by_cost: int  # Octree: 1: a cell becomes a leaf if its octants do not cost less.
     cost_intersection: wp.float64  # Cost of a primitive.
     cost_axis: wp.float64  # Cost of a node whose plane is across an axis.
     cost_plane: wp.float64  # BSP tree: cost of a node with any other plane.

@@ -5,7 +5,7 @@ additional references. The two sides of a range share its spare space in proport
 
 import warp as wp
 
-from wrt.kernels.build.binned import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
+from wrt.kernels.build.bvh2 import BIN_COUNT, BINS, Split, bin_of, binned_split, bins_of
 from wrt.kernels.build.records import (
     MAX_DEPTH,
     BuildData,

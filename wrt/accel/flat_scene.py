@@ -80,11 +80,6 @@ def flat_scene_of(geometry: Geometry | InstancedGeometry, normals: np.ndarray | 
                  None, uvs, material, Placed(geometry.first_prim, first_face[geometry.part], nothing, nothing, geometry.to_world))
 
 
-def with_origin(scene: FlatScene, origin: np.ndarray | None) -> FlatScene:
-    """Return the scene with the origin that its arrays lack."""
-    return scene if origin is None else replace(scene, geometry=replace(scene.geometry, origin=origin))
-
-
 def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Placed | None:
     """Return scene.placed with the matrices of `geometry`, whose instances may have moved."""
     if scene.placed is None or not isinstance(geometry, InstancedGeometry):

@@ -11,22 +11,8 @@ from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
 T = TypeVar("T")
-FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt.accel.base.OneMesh
 
-
-class Structures(Registry[type[Any]]):
-    """Registry of structures over one mesh: name -> class. Raises InputError if a class lacks a field of FIELDS."""
-
-    def __getitem__(self, name: str) -> type[Any]:
-        kind = super().__getitem__(name)
-        for field in FIELDS:
-            if not hasattr(kind, field):
-                of = f"; it is {self.added[name]}" if name in self.added else ""
-                raise InputError(f"class {kind.__name__} has no field {field!r}{of}", place=f"structure {name!r}")
-        return kind
-
-
-ACCELERATORS = Structures("structure", {
+ACCELERATORS: Registry[type[Any]] = Registry("structure", {
     "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",

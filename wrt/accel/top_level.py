@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.bvh.tree import BvhOptions, half_areas
+from wrt.accel.bvh.builders import BvhOptions, half_areas
 from wrt.accel.geometry import Geometry, InstancedGeometry, inverse_of, spread_of
 from wrt.core.device import empty_aligned, on_host, records, start, upload
 from wrt.kernels.traverse.bvh2 import Bvh2Node

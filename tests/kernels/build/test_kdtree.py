@@ -69,7 +69,7 @@ def check_tree(geometry, tree, max_depth, growth):
     assert references <= growth * len(geometry) + 64
 
 
-OPTIONS = [{"max_leaf": 8}, {"cost_intersection": 20.0, "max_growth": 3.0}, {"by_cost": False}]
+OPTIONS = [{"max_leaf": 8}, {"cost_intersection": 20.0, "max_growth": 3.0}]
 
 
 @pytest.mark.parametrize("kind, options", [(kind, {}) for kind in GEOMETRIES if kind != "none"] + [
@@ -144,14 +144,14 @@ def test_clipping_leaves_fewer_references():
 
 
 def test_one_and_two_threads_build_the_same_tree():
-    geometry = Geometry.of(torus(segments=96, tube_segments=32))  # More than perfect_below, and than KEEP.
-    one, two = (make(geometry, threads, perfect_below=1024) for threads in (1, 2))
+    geometry = Geometry.of(torus(segments=96, tube_segments=32))  # More than KD_SAMPLED, and than KEEP.
+    one, two = (make(geometry, threads) for threads in (1, 2))
     assert np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order) and one.cost == two.cost
     check_tree(geometry, one, KdOptions().depth(len(geometry)), 16.0)
 
 
 @pytest.mark.parametrize("options", [
-    {"perfect_below": 1024, "max_leaf": 4}, {"clip": False}, {"empty_bonus": 1.0}, {"max_growth": 1.0}, {"by_cost": False},
+    {"max_leaf": 4}, {"clip": False}, {"empty_bonus": 1.0}, {"max_growth": 1.0},
     {"max_depth": 0}, {"max_depth": STACK_SIZE, "cost_traversal": 0.0}], ids=str)
 @pytest.mark.parametrize("kind", ["mixed", "progression", "flat"])
 def test_options_change_no_answer(kind, options):
@@ -166,7 +166,7 @@ def test_options_change_no_answer(kind, options):
     ({"max_leaf": 0}, ("max_leaf", "must be 1")), ({"max_depth": 65}, ("max_depth", "0 to 64")),
     ({"max_depth": "deep"}, ("max_depth", "int")), ({"max_depth": True}, ("max_depth", "int")),
     ({"empty_bonus": 1.5}, ("empty_bonus", "0 to 1")), ({"cost_traversal": float("nan")}, ("cost_traversal",)),
-    ({"perfect_below": 10}, ("perfect_below", "1024")), ({"max_growth": 0.5}, ("max_growth", "must be 1")),
+    ({"max_growth": 0.5}, ("max_growth", "must be 1")),
     ({"clip": "yes"}, ("clip", "bool")), ({"builder": "sah"}, ("builder", "option of kdtree"))])
 def test_invalid_options_are_refused(options, message):
     with refused(*message):

@@ -17,11 +17,10 @@ import warp as wp
 
 import wrt
 from tests.kernels.units.test_box import pad_kernel
-from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build
-from wrt.accel.structures import ACCELERATORS, NoOptions
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import records
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse.common import Units
@@ -73,14 +72,6 @@ def test_unknown_names_and_devices_are_refused() -> None:
         build(BALL, bulder="sah")
     with refused("threads"):
         build(BALL, threads=0)
-
-
-@pytest.mark.parametrize("field", ["name", "kernels", "options"])
-def test_a_row_from_outside_without_a_field_is_refused_by_name(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    has: dict[str, Any] = {"name": "half", "kernels": ACCELERATORS["bvh2"].kernels, "options": NoOptions}
-    monkeypatch.setitem(ACCELERATORS, "half", type("Half", (OneMesh,), {key: has[key] for key in has if key != field}))
-    with refused(None, f"'{field}'", place="structure 'half'"):
-        build(BALL, "half")
 
 
 @pytest.mark.parametrize("name", NAMES)

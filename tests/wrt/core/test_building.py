@@ -39,7 +39,7 @@ def test_a_list_of_meshes_reports_each_mesh() -> None:
 
 
 def test_subtrees_are_reported_while_they_are_built() -> None:
-    seen, _ = shares(icosphere(4), "kdtree", perfect_below=1024)
+    seen, _ = shares(icosphere(4), "kdtree")
     assert len(seen) > 4 and seen == sorted(seen)
 
 

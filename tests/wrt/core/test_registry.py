@@ -11,7 +11,6 @@ import pytest
 
 from tests.data import ROOT
 from tests.refused import refused
-from wrt.accel.structures import Structures
 from wrt.core.errors import SceneWarning
 from wrt.core.registry import Registry
 
@@ -70,7 +69,7 @@ BROKEN = {"raises": "RuntimeError: boom bang", "exits": "SystemExit: 3", "missin
 
 def test_a_broken_entry_point_of_a_package_is_one_message(broken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(broken)
-    table = Structures("structure", {"brute": "wrt.accel.brute_force:BruteForce"}, "wrt.structures", type)
+    table: Registry[type] = Registry("structure", {"brute": "wrt.accel.brute_force:BruteForce"}, "wrt.structures", type)
     for name, why in BROKEN.items():
         for _ in range(2):
             with refused(what=why) as caught:

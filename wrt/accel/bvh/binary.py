@@ -12,10 +12,9 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, BoxTree
-from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary, sah_cost
+from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, binary_tree_of, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
-from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry, NumberedGeometry
 from wrt.accel.queries.rays import vectors

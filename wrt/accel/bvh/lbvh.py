@@ -2,9 +2,9 @@
 
 import warp as wp
 
+from wrt.accel.bvh.builders import BinaryTree, BvhOptions, small_tree
 from wrt.accel.bvh.refit import Fitting, Root, tree_of
 from wrt.accel.bvh.top_down import build_options
-from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch_on, on_host, start
 from wrt.core.errors import InputError

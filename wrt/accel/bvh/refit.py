@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from wrt.accel.bvh.tree import half_areas
+from wrt.accel.bvh.builders import half_areas
 from wrt.core.device import launch_on, on_host
 from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.build import fit as kernels

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wrt.accel.bvh.builders import BinaryTree, BvhOptions
 from wrt.accel.bvh.top_down import build_binned, build_options
-from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import preloading, records

@@ -6,9 +6,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.bvh.binary import BinaryBvh
-from wrt.accel.bvh.kdop_area import kdop_areas
+from wrt.accel.bvh.builders import expected_cost, root_area, sah_cost
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
-from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built
 from wrt.accel.store import check_links
@@ -24,7 +23,22 @@ NODES_PER_LAUNCH = 512
 SQRT_3 = np.float32(1.7320510)  # rounded up
 
 
-class Bvh2Sphere(BinaryBvh):
+class VolumeBvh(BinaryBvh):
+    """The tree of bvh2 with other volumes, which `_around` fits to the primitives. Options: BinaryOptions."""
+
+    def _boxes(self, built: Built) -> np.ndarray:
+        """Return Bvh2Node records with the links of built.arrays["nodes"] and boxes around the geometry; a missing child is empty."""
+        cpu = start("cpu")
+        nodes = upload(with_common_fields(Bvh2Node, built.arrays["nodes"]), Bvh2Node, cpu)
+        fitting = Fitting(cpu, len(self.geometry), len(nodes))
+        fitting.refit(tree_of(fitting, nodes, parents_of(nodes), upload(built.order.copy(), wp.int32, cpu)), self.geometry.on(cpu))
+        return on_host(nodes).copy()
+
+    def _refit(self, built: Built) -> Built:
+        return self._around(self._boxes(built), built.order, built.leaves, built.depth)
+
+
+class Bvh2Sphere(VolumeBvh):
     """A binary BVH of bounding spheres around the primitives' padded boxes. Options: BinaryOptions."""
 
     name = "bvh2_sphere"
@@ -34,25 +48,21 @@ class Bvh2Sphere(BinaryBvh):
         spheres = fit_spheres(nodes, order, self.geometry, self.threads)
         radius = np.stack([spheres["sphere_0"][:, 3], spheres["sphere_1"][:, 3]]).astype(np.float64)
         areas = np.where(radius >= 0.0, 4.0 * np.pi * radius * radius, 0.0)
-        return Built({"nodes": spheres}, order, len(nodes), leaves, depth, cost_of(nodes, areas))
+        # Parts of spheres outside of the root's box count, too.
+        cost = expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
+        return Built({"nodes": spheres}, order, len(nodes), leaves, depth, cost)
 
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]
         empty = [nodes[f"sphere_{side}"][:, 3] < 0.0 for side in "01"]
         check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
 
-    def _boxes(self, built: Built) -> np.ndarray:
-        return boxes_around(built, self.geometry)
 
-    def _refit(self, built: Built) -> Built:
-        return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)
-
-
-class Bvh2Kdop(BinaryBvh):
+class Bvh2Kdop(VolumeBvh):
     """A binary BVH of 14-DOPs: the boxes of bvh2, cut by eight diagonal planes. Options: BinaryOptions.
 
     All 14-DOPs have the same plane normals, unlike oriented boxes. So they are fitted from the leaves up without a search, and a ray
-    is prepared once for all nodes. Three of the seven slabs are the box itself.
+    is prepared once for all nodes. Three of the seven slabs are the box itself. AccelStats.sah_cost is that of the boxes, a bound.
     """
 
     name = "bvh2_kdop"
@@ -61,31 +71,7 @@ class Bvh2Kdop(BinaryBvh):
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         middle = middle_of(nodes)
         kdops = fit_kdops(nodes, order, self.geometry, middle)
-        return Built({"nodes": kdops, "middle": middle}, order, len(nodes), leaves, depth,
-                     cost_of(nodes, kdop_areas(kdops, middle)))
-
-    def _boxes(self, built: Built) -> np.ndarray:
-        return boxes_around(built, self.geometry)
-
-    def _refit(self, built: Built) -> Built:
-        return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)
-
-
-def boxes_around(built: Built, geometry: Geometry) -> np.ndarray:
-    """Return Bvh2Node records with the links of built.arrays["nodes"] and boxes around the geometry; a missing child is empty."""
-    cpu = start("cpu")
-    nodes = upload(with_common_fields(Bvh2Node, built.arrays["nodes"]), Bvh2Node, cpu)
-    fitting = Fitting(cpu, len(geometry), len(nodes))
-    fitting.refit(tree_of(fitting, nodes, parents_of(nodes), upload(built.order.copy(), wp.int32, cpu)), geometry.on(cpu))
-    return on_host(nodes).copy()
-
-
-def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
-    """Return the SAH cost of volumes with these surface areas, (2, N), for lines through the root's box.
-
-    Parts of volumes outside of the root's box count, too.
-    """
-    return expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
+        return Built({"nodes": kdops, "middle": middle}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
 
 def spans_of(nodes: np.ndarray) -> list[np.ndarray]:

@@ -12,10 +12,9 @@ import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, INNER, BoxTree
-from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
+from wrt.accel.bvh.builders import BinaryOptions, BinaryTree, BvhOptions, binary_tree_of, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.top_down import build_few
-from wrt.accel.bvh.tree import BinaryTree, binary_tree_of
 from wrt.accel.bvh.wide_tree import (
     WideTree,
     check_wide,

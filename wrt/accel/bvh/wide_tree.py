@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.box_tree import BoxTree
-from wrt.accel.bvh.tree import BinaryTree, expected_cost, half_areas
+from wrt.accel.bvh.builders import BinaryTree, expected_cost, half_areas
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import launch, start, upload

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any
@@ -11,9 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Built
-from wrt.accel.store import row_type
 from wrt.core.building import tally
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
@@ -24,7 +21,6 @@ from wrt.kernels.build.cell_splits import RULES
 from wrt.kernels.build.clip import Shapes
 from wrt.kernels.build.records import BuildRecord
 from wrt.kernels.traverse.plane_layouts import LEAF, BspNode
-from wrt.kernels.warp_private import fields_of
 
 # Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.
 CLIP_SIZES = (1e-30, 1e30)
@@ -139,17 +135,6 @@ def joined(parts: list[Subtree], area: float) -> Tree:
     cost = 0.0 if not first_reference else float(totals["cost"].sum()) / area if area > 0.0 else float("nan")
     return Tree(np.concatenate(nodes), np.concatenate([part.order for part in parts]), int(totals["leaves"].sum()),
                 int(totals["depth"].max()), cost)
-
-
-def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
-    """Return the arrays of `built`. Arrays of one row, as files have them, become the vectors and scalars of the structure's struct."""
-    arrays = dict(built.arrays)
-    for name, kind in fields_of(accel.structure.struct()).items():
-        if name in arrays and not isinstance(kind, wp.array):
-            if np.size(arrays[name]) != math.prod(row_type(kind).shape):
-                raise InputError(f"is damaged: {name} has a wrong size")
-            arrays[name] = np.reshape(arrays[name], row_type(kind).shape)
-    return arrays
 
 
 def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.bvh.tree import half_areas
-from wrt.accel.cells.common import check_references, one_row, require_between, shapes_of
+from wrt.accel.bvh.builders import half_areas
+from wrt.accel.cells.common import check_references, require_between, shapes_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built
 from wrt.core.device import launch, on_host, records, start, upload
@@ -63,7 +63,7 @@ class Grid(OneMesh):
                      sah_cost(layout, len(cells) + len(references)))
 
     def _check(self, built: Built) -> None:
-        arrays = one_row(self, built)
+        arrays = built.arrays
         if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
             raise InputError("is damaged: pad, extent or mailbox is out of range")
         lo, hi, size, n = (arrays[name] for name in ("lo", "hi", "size", "n"))

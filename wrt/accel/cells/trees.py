@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, one_row, require_between, shapes_of
+from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, require_between, shapes_of
 from wrt.accel.snapshot import Built
 from wrt.accel.store import check_tree
 from wrt.core.checks import shown
@@ -25,6 +25,7 @@ MAX_IN_LEAF = 1 << 24  # primitives, because a node stores their number as a flo
 MAX_INDEX = 1 << 29  # Of a node or reference, because a node's word has 29 bits for it.
 MAX_BSP_DEPTH = 60
 SAMPLED = 256  # In cells of a BSP tree with more primitives, so many of them propose planes across an axis.
+KD_SAMPLED = 1024  # Likewise in a k-d tree.
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,9 @@ class KdOptions:
 
     max_leaf: int = 1  # Cells of so many primitives or fewer are not split.
     max_depth: int | None = None  # Levels below the root; None: 8 + 1.3 log2 n.
-    by_cost: bool = True  # Do not split if that costs more than a leaf.
     cost_traversal: float = 2.0  # SAH cost of a node.
     cost_intersection: float = 1.0  # SAH cost of a primitive.
     empty_bonus: float = 0.1  # Discount, 0 to 1, for splits that cut off empty space.
-    perfect_below: int = 1024  # In cells with more primitives, so many of them, evenly spread, choose the plane.
     clip: bool = True  # Clip triangles to cells exactly.
     max_growth: float = 16.0  # Limit of references and empty leaves per primitive.
 
@@ -45,9 +44,8 @@ class KdOptions:
         if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
             raise InputError(f"must be int or None, got {shown(self.max_depth)}", argument="max_depth")
         require_between(max_leaf=(self.max_leaf, 1, MAX_IN_LEAF), max_depth=(self.max_depth or 0, 0, kernels.STACK_SIZE),
-                        perfect_below=(self.perfect_below, 1024, 1 << 27), cost_traversal=(self.cost_traversal, 0.0, 1e6),
-                        cost_intersection=(self.cost_intersection, 0.0, 1e6), empty_bonus=(self.empty_bonus, 0.0, 1.0),
-                        max_growth=(self.max_growth, 1.0, 1e4))
+                        cost_traversal=(self.cost_traversal, 0.0, 1e6), cost_intersection=(self.cost_intersection, 0.0, 1e6),
+                        empty_bonus=(self.empty_bonus, 0.0, 1.0), max_growth=(self.max_growth, 1.0, 1e4))
 
     def depth(self, n: int) -> int:
         """Return max_depth; None: 8 + 1.3 log2 n for n primitives (Havran 2000; Pharr et al., "Physically Based Rendering", 4.4)."""
@@ -66,9 +64,9 @@ class KdTree(OneMesh):
     def _build(self, options: KdOptions) -> Built:
         bounds, n = bounds_of(self.geometry), len(self.geometry)
         chosen = CellOptions()
-        chosen.max_leaf, chosen.max_depth, chosen.by_cost = options.max_leaf, options.depth(n), options.by_cost
+        chosen.max_leaf, chosen.max_depth = options.max_leaf, options.depth(n)
         chosen.cost_axis, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
-        chosen.empty_bonus, chosen.sampled = options.empty_bonus, options.perfect_below
+        chosen.empty_bonus, chosen.sampled = options.empty_bonus, KD_SAMPLED
         tree = build_tree("kdtree", shapes_of(self.geometry, bounds, options.clip), root_of(bounds, options.max_growth, 64), chosen,
                           self.threads)
         if max(len(tree.nodes), len(tree.order)) >= MAX_INDEX or tree.nodes["count"].max() > MAX_IN_LEAF:
@@ -79,7 +77,7 @@ class KdTree(OneMesh):
         return tree.built(box_arrays(bounds) | {"nodes": nodes})
 
     def _check(self, built: Built) -> None:
-        nodes = one_row(self, built)["nodes"]
+        nodes = built.arrays["nodes"]
         leaf, first = (nodes["word"] & 3) == layouts.KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
         check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
                    kernels.STACK_SIZE)
@@ -93,19 +91,14 @@ class BspOptions:
     """Options of the BSP tree. Raises InputError for values out of range."""
 
     cost_intersection: float = 1.0  # SAH cost of a primitive.
-    cost_axis: float = 1.0  # SAH cost of a node with an axis-aligned plane.
-    cost_plane: float = 1.0  # SAH cost of any other node.
     samples: int = 2  # Triangles per cell, evenly spread over its list, that propose four planes each; 0: a k-d tree.
     max_depth: int = 0  # From 1 to 60; 0: 16 + 2 log2 of the number of primitives.
     max_growth: float = 16.0  # Limit of references per primitive, 1 to 1000.
     max_triangles: int = 500_000  # Largest number of primitives.
 
     def __post_init__(self) -> None:
-        for name in ("cost_intersection", "cost_axis", "cost_plane"):
-            if not 0.0 < (value := getattr(self, name)) < math.inf:
-                raise InputError(f"must be above 0 and finite, got {value}", argument=name)
-        require_between(samples=(self.samples, 0, 1 << 30), max_depth=(self.max_depth, 0, MAX_BSP_DEPTH),
-                        max_growth=(self.max_growth, 1.0, 1000.0))
+        require_between(cost_intersection=(self.cost_intersection, 1e-6, 1e6), samples=(self.samples, 0, 1 << 30),
+                        max_depth=(self.max_depth, 0, MAX_BSP_DEPTH), max_growth=(self.max_growth, 1.0, 1000.0))
 
 
 class Bsp(OneMesh):
@@ -125,14 +118,14 @@ class Bsp(OneMesh):
             raise InputError(f"bsp is slow to build, so that max_triangles={options.max_triangles} is the limit; there are {n}",
                              argument="max_triangles", hint="use another structure (kdtree, bvh), or raise max_triangles")
         bounds, chosen = bounds_of(self.geometry), CellOptions()
-        chosen.cost_intersection, chosen.cost_axis, chosen.cost_plane = options.cost_intersection, options.cost_axis, options.cost_plane
+        chosen.cost_intersection, chosen.cost_axis, chosen.cost_plane = options.cost_intersection, 1.0, 1.0
         chosen.sampled, chosen.triangles = SAMPLED, options.samples
         chosen.max_depth = options.max_depth or min(MAX_BSP_DEPTH, 16 + 2 * math.ceil(math.log2(max(n, 1))))
         tree = build_tree("bsp", shapes_of(self.geometry, bounds), root_of(bounds, options.max_growth), chosen, self.threads)
         return tree.built(box_arrays(bounds) | {"nodes": tree.nodes})
 
     def _check(self, built: Built) -> None:
-        nodes = one_row(self, built)["nodes"]
+        nodes = built.arrays["nodes"]
         leaf = nodes["axis"] == layouts.LEAF
         if ((nodes["axis"] < 0) | (nodes["axis"] > layouts.LEAF) | ~leaf & (nodes["count"] < 1) | ~leaf & (nodes["count"] > 3)).any():
             raise InputError("is damaged: a node's axis or count is out of range")
@@ -181,7 +174,7 @@ class Octree(OneMesh):
         return tree.built(box_arrays(bounds) | arrays, np.arange(n, dtype=np.int32))
 
     def _check(self, built: Built) -> None:
-        arrays = one_row(self, built)
+        arrays = built.arrays
         levels, lo, hi, nodes = int(arrays["levels"]), arrays["lo"], arrays["hi"], arrays["nodes"]
         if not (arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
             raise InputError("is damaged: extent or mailbox is out of range")

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
@@ -15,7 +16,7 @@ import warp as wp
 from wrt.accel.base import OneMesh, from_tree
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.device_geometry import DeviceGeometry
-from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
+from wrt.accel.flat_scene import FlatScene, flat_scene_of
 from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.flatten import flatten, worlds_over
@@ -61,15 +62,12 @@ class BuildOptions(TypedDict, total=False):
     split_budget: float
     cost_traversal: float  # bvh*, kdtree
     cost_intersection: float  # bvh*, kdtree, bsp
-    cost_axis: float  # bsp
-    cost_plane: float
-    samples: int
+    samples: int  # bsp
     max_triangles: int
     max_depth: int | None  # kdtree, octree, bsp
     max_growth: float
-    by_cost: bool  # kdtree, octree
+    by_cost: bool  # octree
     empty_bonus: float  # kdtree
-    perfect_below: int
     clip: bool
     density: float  # grid
     mailbox: bool  # grid, octree
@@ -236,7 +234,8 @@ def to_flat_scene(mesh: MeshLike) -> FlatScene:
     if isinstance(mesh, Scene):
         origin = scene_origin(mesh)
         near = moved_by(mesh, origin)
-        return with_origin(flatten(near, instanced_meshes(near)), origin)
+        flat = flatten(near, instanced_meshes(near))
+        return flat if origin is None else replace(flat, geometry=replace(flat.geometry, origin=origin))
     return deepcopy(flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs))
 
 

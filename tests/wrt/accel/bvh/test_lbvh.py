@@ -9,9 +9,8 @@ from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
 import warp as wp
 
 import wrt
-from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
-from wrt.accel.bvh.tree import sah_cost
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.store import check_binary

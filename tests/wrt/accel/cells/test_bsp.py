@@ -22,7 +22,7 @@ from wrt.scene.shapes import icosphere
 
 
 @pytest.mark.parametrize(("option", "value"), [
-    ("cost_intersection", 0.0), ("cost_axis", -1.0), ("cost_plane", np.inf), ("samples", -1), ("max_depth", -1), ("max_depth", 61),
+    ("cost_intersection", 0.0), ("samples", -1), ("max_depth", -1), ("max_depth", 61),
     ("max_depth", 3.5), ("max_growth", 0.5), ("max_growth", np.nan), ("progress", 1)])
 def test_options_out_of_range_are_refused(option: str, value: float) -> None:
     with refused(option):
@@ -65,7 +65,7 @@ def test_samples_decide_whether_there_are_tilted_planes() -> None:
 
 @pytest.mark.parametrize("kind", ["all_equal", "coincident", "progression", "flat", "tiny_and_huge", "long_thin"])
 def test_depth_is_bounded(kind: str) -> None:
-    for options in ({}, {"cost_plane": 1e-3, "cost_axis": 1e-3}, {"max_depth": 3}):
+    for options in ({}, {"max_depth": 3}):
         stats = build(GEOMETRIES[kind](np.random.default_rng(2)), "bsp", **options).stats
         assert stats.depth <= options.get("max_depth", STACK_SIZE - 4) + 1
 
@@ -185,6 +185,4 @@ def test_a_damaged_tree_is_refused(field: str, row: int, value: int, message: st
     spoiled = replace(tree.built, arrays=tree.built.arrays | {"nodes": nodes})
     with refused(what=message):
         Bsp.restore(spoiled, tree.geometry)
-    with refused(what="wrong size"):
-        Bsp.restore(replace(tree.built, arrays=tree.built.arrays | {"lo": np.zeros(2, np.float32)}), tree.geometry)
     assert isinstance(Bsp.restore(tree.built, tree.geometry), Bsp)
