@@ -180,14 +180,20 @@ def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int,
     inner_of = []
     for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
-        leaf = count > 0
-        if (empty & ((first != 0) | leaf)).any():  # kernels read `first` and `count`, not the box
+        inner = count == 0
+        if (empty & ((first != 0) | ~inner)).any():  # kernels read `first` and `count`, not the box
             raise InputError("is damaged: a child that does not exist has a link")
-        if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any():
-            raise InputError("is damaged: a node leads out of the tree")
-        inner_of.append(np.flatnonzero(~leaf & ~empty))
+        check_ranges(first[~inner], count[~inner], n_primitives)
+        inner_of.append(np.flatnonzero(inner & ~empty))
     check_tree(len(nodes), np.concatenate(inner_of), np.concatenate([nodes[f"first_{i}"][of] for i, of in enumerate(inner_of)]),
                max_depth - 1)
+
+
+def check_ranges(first: np.ndarray, count: np.ndarray, n: int) -> None:
+    """Raise InputError unless the records first .. first + count - 1 of each leaf are among n records."""
+    first, count = first.astype(np.float64), count.astype(np.float64)
+    if not ((first >= 0.0) & (count >= 0.0) & (first + count <= n)).all():
+        raise InputError("is damaged: a leaf leads out of the primitives")
 
 
 def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:

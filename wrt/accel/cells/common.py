@@ -11,6 +11,7 @@ import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built
+from wrt.accel.store import check_ranges
 from wrt.core.building import tally
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
@@ -139,9 +140,7 @@ def joined(parts: list[Subtree], area: float) -> Tree:
 
 def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:
     """Raise InputError unless the records (first, count) of cells address references, and all references address primitives."""
-    first, count = cells["first"].astype(np.int64), cells["count"].astype(np.int64)
-    if ((first < 0) | (count < 0) | (first + count > len(references))).any():
-        raise InputError("is damaged: a cell leads out of the references")
+    check_ranges(cells["first"], cells["count"], len(references))
     if ((references < 0) | (references >= n_primitives)).any():
         raise InputError("is damaged: a reference leads out of the primitives")
 

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.base import OneMesh
 from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, require_between, shapes_of
 from wrt.accel.snapshot import Built
-from wrt.accel.store import check_tree
+from wrt.accel.store import check_ranges, check_tree
 from wrt.core.checks import shown
 from wrt.core.device import records
 from wrt.core.errors import InputError
@@ -81,9 +81,7 @@ class KdTree(OneMesh):
         leaf, first = (nodes["word"] & 3) == layouts.KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
         check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
                    kernels.STACK_SIZE)
-        first, count = first[leaf], nodes["split"][leaf].astype(np.float64)
-        if not ((first >= 0) & (count >= 0.0) & (first + count <= len(built.order))).all():
-            raise InputError("is damaged: a leaf leads out of the primitives")
+        check_ranges(first[leaf], nodes["split"][leaf], len(built.order))
 
 
 @dataclass(frozen=True)
@@ -130,9 +128,7 @@ class Bsp(OneMesh):
         if ((nodes["axis"] < 0) | (nodes["axis"] > layouts.LEAF) | ~leaf & (nodes["count"] < 1) | ~leaf & (nodes["count"] > 3)).any():
             raise InputError("is damaged: a node's axis or count is out of range")
         check_children(nodes["first"][~leaf], nodes["count"][~leaf], np.flatnonzero(~leaf), len(nodes), kernels.STACK_SIZE)
-        first, count = nodes["first"][leaf].astype(np.int64), nodes["count"][leaf].astype(np.int64)
-        if not ((first >= 0) & (count >= 0) & (first + count <= len(built.order))).all():
-            raise InputError("is damaged: a leaf leads out of the primitives")
+        check_ranges(nodes["first"][leaf], nodes["count"][leaf], len(built.order))
 
 
 @dataclass(frozen=True)
