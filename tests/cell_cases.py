@@ -8,7 +8,6 @@ import numpy as np
 from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.scene.mesh import Mesh
 
 NO_SPHERES = np.zeros((0, 4), np.float32)
 
@@ -56,29 +55,6 @@ def grazing(rng, n):
     direction[:, 1] = rng.choice([-1.0, 1.0], n) * 10.0 ** rng.uniform(-9, -4, n)
     origin = target - direction * rng.uniform(0.0, 2.0, (n, 1))
     return triangles(corners), origin.astype(np.float32), direction.astype(np.float32)
-
-
-def segments(rng, n=400):
-    """Return n triangles without area. Cells list them, but rays never hit them, so that a traversal visits every cell of a line."""
-    ends = rng.uniform(-1.0, 1.0, (n, 2, 3)) * [1.0, 0.5, 2.0]
-    first = 2 * np.arange(n)
-    return Geometry.of(Mesh(ends.reshape(-1, 3), np.stack([first, first + 1, first], axis=1)))
-
-
-def random_lines(lo, hi, n, rng):
-    """Return uniform random lines through a box: points on its surface, uniform in area, with cosine-distributed inward directions."""
-    extent = hi - lo
-    area = np.array([extent[1] * extent[2], extent[2] * extent[0], extent[0] * extent[1]])
-    axis = rng.choice(3, n, p=area / area.sum())
-    side = rng.integers(0, 2, n)
-    point = lo + rng.random((n, 3)) * extent
-    point[np.arange(n), axis] = np.where(side == 0, lo[axis], hi[axis])
-    r, phi = np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
-    direction = np.empty((n, 3))
-    direction[np.arange(n), axis] = np.where(side == 0, 1.0, -1.0) * np.sqrt(1.0 - r**2)
-    direction[np.arange(n), (axis + 1) % 3] = r * np.cos(phi)
-    direction[np.arange(n), (axis + 2) % 3] = r * np.sin(phi)
-    return (point - direction).astype(np.float32), direction.astype(np.float32)
 
 
 def assert_same(found, expected):

@@ -43,7 +43,7 @@ class WideTree:
     hi: wp.array(dtype=wp.vec3)
     source: wp.array(dtype=wp.int32)  # Scratch: the children of one node, each as 2 * binary node + side.
     order: wp.array(dtype=wp.int32)  # prim_id of each primitive, row after row; -1 in the unused entries of a row.
-    count: wp.array(dtype=wp.int32)  # Numbers of nodes, rows, leaves; depth; largest number of entries on a traversal's stack.
+    count: wp.array(dtype=wp.int32)  # Numbers of nodes, rows, leaves; depth.
 
 
 @wp.struct
@@ -285,7 +285,6 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     out.count[1] = 0
     n_leaves = int(0)
     depth = int(0)
-    least_free = int(options.stack)
     while size > 0:
         size = size - 1
         task = stack[size]
@@ -293,7 +292,6 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
         base = task.slot * options.width
         n = choose_roots(nodes, options, trees, task, out)
         free_entries = task.free_entries - (n - 1)
-        least_free = wp.min(least_free, free_entries)
         for j in range(n):
             # The inner children of a node get consecutive slots. The last of them is popped first, so its children get the next slots.
             code = out.source[j]
@@ -319,7 +317,6 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     out.count[0] = n_nodes
     out.count[2] = n_leaves
     out.count[3] = depth
-    out.count[4] = options.stack - least_free
 
 
 @kernel

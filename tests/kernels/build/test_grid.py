@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
+from tests.cell_cases import CASES, assert_damage_is_refused, points_of, triangles
 from tests.refused import refused
 from wrt.accel.cells import grid as module
 from wrt.accel.scenes.build import build
@@ -95,17 +95,6 @@ def test_too_many_references_make_larger_cells_and_a_warning(monkeypatch):
 def test_invalid_densities_are_refused(density):
     with refused("density"):
         build(icosphere(0), "grid", density=density)
-
-
-def test_random_lines_cost_what_the_statistics_expect():
-    rng = np.random.default_rng(5)
-    grid = build(segments(rng), "grid", mailbox=False, density=5.0)
-    lo, hi = np.array(grid.data.lo, np.float64), np.array(grid.data.hi, np.float64)
-    n = 40_000
-    hits = grid.closest_hit(*random_lines(lo, hi, n, rng), counters=True)
-    assert (hits.prim_id < 0).all()
-    cost = hits.counters.nodes + hits.counters.primitives
-    assert abs(cost.mean() - grid.stats.sah_cost) < 3.0 * cost.std() / np.sqrt(n)
 
 
 @pytest.mark.parametrize(("name", "change"), [

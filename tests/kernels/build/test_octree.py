@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
+from tests.cell_cases import CASES, assert_damage_is_refused, points_of, triangles
 from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
@@ -119,16 +119,6 @@ def test_references_are_limited_in_every_part_alike():
 def test_invalid_options_are_refused(options):
     with refused(next(iter(options))):
         build(icosphere(0), "octree", **options)
-
-
-def test_random_lines_cost_what_the_statistics_expect():
-    rng = np.random.default_rng(5)
-    octree = build(segments(rng), "octree", mailbox=False, max_leaf=3)
-    lo, hi = (np.array(corner, np.float64) for corner in (octree.data.lo, octree.data.hi))
-    hits = octree.closest_hit(*random_lines(lo, hi, 40_000, rng), counters=True)
-    assert (hits.prim_id < 0).all() and octree.stats.depth > 4
-    cost = hits.counters.nodes + hits.counters.primitives
-    assert abs(cost.mean() - octree.stats.sah_cost) < 3.0 * cost.std() / 200.0
 
 
 @pytest.mark.parametrize(("name", "change"), [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import threading
 from fractions import Fraction
 from typing import Any
 
@@ -42,23 +40,6 @@ def test_the_registry_names_what_it_holds() -> None:
         assert ACCELERATORS[name].name == name
         assert type(build(BALL, name)) is ACCELERATORS[name]
     assert wrt.ACCELERATORS is ACCELERATORS
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "bsp"])  # bsp takes seconds
-def test_threads_of_a_build_parse_no_types(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # NumPy parses a struct's layout with `ast`; in CPython 3.11, two threads that do so at once can raise a SystemError.
-    parse = ast.parse
-    in_threads = []
-
-    def noted(*args: Any, **options: Any) -> Any:
-        in_threads.extend([args] if threading.current_thread() is not threading.main_thread() else [])
-        return parse(*args, **options)
-
-    ball = icosphere(5)
-    build(BALL, name, threads=3)  # compiles
-    monkeypatch.setattr(ast, "parse", noted)
-    build(ball, name, threads=3)
-    assert not in_threads
 
 
 def test_unknown_names_and_devices_are_refused() -> None:
@@ -148,37 +129,24 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (([[0, 0]], [[1, 0, 0]]), ("origins", "(..., 3)")),
-    (([0, 0], [[1, 0, 0]]), ("origins", "(..., 3)")),
     ((0.0, [[1, 0, 0]]), ("origins", "(..., 3)")),
     (([[0, 0, 0]] * 3, [[1, 0, 0], [0, 1, 0]]), ("directions", "broadcasts")),
     (([[0, 0, 0]], [[0, 0, 0]]), ("directions", "row 0")),
-    (([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-0.0, 0, 0]]), ("directions", "row 1")),
     (([[0, np.nan, 0]], [[1, 0, 0]]), ("origins", "row 0")),
     (([[0, 0, 0]], [[1, np.inf, 0]]), ("directions", "finite")),
     (([["a", "b", "c"]], [[1, 0, 0]]), ("origins",)),
     (([[0, 0, 0]], [[1, 0, 0]], -1.0), ("t_min", "NaN or below 0")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.nan), ("t_max", "NaN")),
     (([[0, 0, 0]], [[1, 0, 0]], [0.0, 0.0]), ("t_min", "number or (1,)")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, [[1.0]]), ("t_max", "number or (1,)")),
     (([[0, 0, 0]], [[1, 0, 0]], "near"), ("t_min",)),
     (([[0, 0, 0], [1e38, 0, 0]], [[1, 0, 0]] * 2), ("origins", "row 1")),
-    (([[0, 0, -1.1e37]], [[1, 0, 0]]), ("origins", "row 0")),
-    (([[0, 0, 1e300]], [[1, 0, 0]]), ("origins", "row 0")),
     (([[0, 0, 10**400]], [[1, 0, 0]]), ("origins", "(..., 3)")),
     ((np.zeros((1, 3), complex), [[1, 0, 0]]), ("origins", "(..., 3)")),
-    (([[0, 0, 0]], [[1j, 0, 0]]), ("directions", "(..., 3)")),
     ((np.zeros((1, 3), bool), [[1, 0, 0]]), ("origins", "(..., 3)")),
-    (([[0, 0, 0]], [["1", "0", "0"]]), ("directions", "(..., 3)")),
     ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), ("origins", "(..., 3)")),
     ((np.ma.zeros((1, 3)), [[1, 0, 0]]), ("origins", "masked array")),
-    (([[0, 0, 0]], np.ma.masked_less([[1.0, 0, 0]], 0.5)), ("directions", "masked array")),
-    (([[0, 0, 0]], [[1, 0, 0]], 1j), ("t_min", "number or (1,)")),
     (([[0, 0, 0]], [[1, 0, 0]], True), ("t_min", "number or (1,)")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.ma.ones(1)), ("t_max", "masked array")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, "5"), ("t_max", "number")),
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, None), ("t_max",)),
     (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, 1.5), ("threads", "whole number")),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, "2"), ("threads", "whole number")),
     ((np.zeros((0, 3)), np.zeros((0, 3)), 0.0, 1.0, 1.5), ("threads", "whole number")),
 ])
 @pytest.mark.filterwarnings("error")  # one message, and no other
@@ -210,18 +178,6 @@ def test_origins_may_be_as_far_as_1e37_and_directions_of_any_length() -> None:
     structure = build(BALL, "brute_force")
     hits = structure.closest_hit([[1e37, 0, 0], [-1e37, 1e37, 0], [0, 0, 0]], [[-1e37, 0, 0], [1, 0, 0], [0, 3.4e38, 0]])
     assert hits.t[0] == 1.0 and hits.prim_id[1] == -1 and 0.0 < hits.t[2] < 1e-38
-
-
-def test_a_zero_among_directions_along_the_axes_is_found() -> None:
-    structure = build(BALL, "brute_force")
-    directions = np.tile(np.float32([[0, 1, 0], [0, 0, -1e-45], [1, 0, 0], [0, -1, 2]]), (50, 1))
-    origins = np.zeros_like(directions)
-    assert len(structure.closest_hit(origins, directions)) == 200
-    for row in (0, 1, 137, 199):
-        wrong = directions.copy()
-        wrong[row] = 0.0, -0.0, 0.0
-        with refused("directions", f"row {row} is"):
-            structure.closest_hit(origins, wrong)
 
 
 def test_gradients_that_there_are_not_are_refused_and_not_lost_in_silence() -> None:
@@ -262,11 +218,6 @@ def test_bad_warp_arrays_are_named() -> None:
                                  ("t_max", np.nan, ("t_max", "NaN"))):
         with refused(*message):
             structure.closest_hit(good, good, **{name: wp.array([value], dtype=wp.float32, device="cpu")})
-
-
-def test_threads_must_be_positive() -> None:
-    with refused("threads", "must be 1 to"):
-        build(BALL).closest_hit([[0, 0, 0]], [[1, 0, 0]], threads=0)
 
 
 @pytest.mark.parametrize("name", NAMES)

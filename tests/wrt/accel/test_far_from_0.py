@@ -164,13 +164,6 @@ def test_open3d_scenes_of_float64(name: str) -> None:
         assert np.allclose(found[1][key], near, rtol=0.0, atol=2e-5 if key in ("primitive_uvs", "primitive_normals") else 2e-6), key
 
 
-def test_open3d_warns_of_float32_far_away() -> None:
-    scene = RaycastingScene()
-    scene.add_triangles(np.float32(VERTICES + PLACES["UTM"]), FACES)
-    with pytest.warns(SceneWarning, match="float32 has steps of 0.5 units"):
-        scene.cast_rays([[529000.0, 5801000.0, 90.0, 0.0, 0.0, -1.0]])
-
-
 def test_sensors_and_camera_rays_far_away_keep_their_places() -> None:
     place, pose = np.array(PLACES["UTM"]), np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.diag([1, -1, -1]), place + [0, 0, 40]

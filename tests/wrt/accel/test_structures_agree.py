@@ -71,12 +71,6 @@ def test_same_hits_as_brute_force(structure: str, name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SMALL + LARGE)
-def test_the_bvh_gives_the_same_hits_as_brute_force_on_100k_rays(name: str) -> None:
-    check("bvh2", name, 100_000)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL + LARGE + LARGEST)
 @pytest.mark.parametrize("structure", [name for name in STRUCTURES if name != "bvh2"])
 def test_same_hits_as_the_bvh_on_a_million_rays(structure: str, name: str) -> None:

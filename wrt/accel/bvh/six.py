@@ -16,7 +16,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.traverse import bvh6 as kernels
 from wrt.kernels.traverse.bvh6 import LEAVES_SHIFT, WIDTH, Bvh6Node
 from wrt.kernels.wide.layout import EXIST_SHIFT, FIRST_BYTES, WORD
-from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
+from wrt.kernels.wide.references import EMPTY, leaf_first, leaf_reference
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,10 @@ class Bvh6(CollapsedBvh):
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
     def _arranged(self, tree: WideTree) -> WideTree:
-        if (leaf_count.func(tree.children[tree.children < 0]) > 1).any():
-            raise InputError("bvh6 holds one primitive per leaf, and the tree has leaves with more", argument="accel", hint="use bvh8")
-        return grouped(tree)
+        tree = grouped(tree)
+        if not np.array_equal(self._references(Built(self._arrays(tree), tree.order[:, 0])), tree.children):
+            raise InputError("bvh6 takes binary trees with one primitive per leaf", argument="accel", hint="use bvh8")
+        return tree
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
         """Return the nodes of a tree that `grouped` made."""
@@ -81,7 +82,7 @@ class Bvh6(CollapsedBvh):
         head[:, FIRST_BYTES:] = np.ascontiguousarray(nodes["planes"]).view(np.float32)
         lanes = np.full((len(built.order), WIDTH), -1, np.int32)
         lanes[:, 0] = built.order
-        return WideTree(*decompress(head, WIDTH), children, lanes, built.leaves, built.depth, 0)
+        return WideTree(*decompress(head, WIDTH), children, lanes, built.leaves, built.depth)
 
     def decoded(self) -> WideTree:
         """Return the tree with the boxes that rays are tested against; each leaf is a row with one primitive."""
@@ -105,29 +106,9 @@ def _counts(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grouped(tree: WideTree) -> WideTree:
-    """Return a tree of one-primitive leaves with inner nodes first in each node; its inner nodes and its leaves have successive indices."""
-    children = tree.children.astype(np.int64)
-    # Sort the slots: inner nodes by index, leaves by index, then empty slots.
-    none = np.int64(1) << 40
+    """Return the tree with the slots of each node sorted: inner nodes by index, leaves by index, then empty slots."""
+    children, none = tree.children.astype(np.int64), np.int64(1) << 40
     key = np.where(children > 0, children, np.where(children < 0, (none >> 1) + leaf_first.func(children), none))
     slots = np.argsort(key, axis=1, kind="stable")
-    children = np.take_along_axis(children, slots, axis=1)
     lo, hi = (np.take_along_axis(box, slots[..., None], axis=1) for box in (tree.lo, tree.hi))
-    index, row = np.zeros(len(children), np.int64), np.zeros(len(tree.order), np.int64)
-    inner, leaf = children > 0, children < 0
-    # Groups of siblings keep the order of their first members, which is the order of the builder.
-    index[children[inner]] = 1 + _ranks(np.where(inner, children, none).min(axis=1), inner)
-    row[leaf_first.func(children[leaf])] = _ranks(np.where(leaf, leaf_first.func(children), none).min(axis=1), leaf)
-    renumbered = np.where(inner, index[np.where(inner, children, 0)], EMPTY)
-    renumbered[leaf] = leaf_reference.func(row[leaf_first.func(children[leaf])], 1)
-    node_at, row_at = np.argsort(index, kind="stable"), np.argsort(row, kind="stable")
-    return replace(tree, lo=lo[node_at], hi=hi[node_at], children=renumbered[node_at].astype(np.int32), order=tree.order[row_at])
-
-
-def _ranks(first: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Return the rank of each chosen slot: nodes sorted by `first` (N,), then by slot. chosen: (N, W) bool; result: (chosen.sum(),)."""
-    count = chosen.sum(axis=1)
-    at = np.argsort(first, kind="stable")
-    begin = np.empty(len(count), np.int64)
-    begin[at] = np.cumsum(count[at]) - count[at]
-    return np.repeat(begin, count) + np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    return replace(tree, lo=lo, hi=hi, children=np.take_along_axis(tree.children, slots, axis=1))

@@ -184,7 +184,7 @@ class WideBvh(CollapsedBvh):
             planes = head.reshape(-1, len(PLANES), self.width)
             lo, hi = (np.ascontiguousarray(planes[:, end::2].transpose(0, 2, 1)) for end in range(2))
         children = packed(self._references(built), self.width)
-        return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
+        return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth)
 
     def _primitives(self, built: Built) -> np.ndarray:
         """Return the records of the triangle test in rows of `width` lanes; an unused lane repeats the primitive before it."""

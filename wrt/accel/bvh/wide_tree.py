@@ -27,7 +27,6 @@ class WideTree:
     order: np.ndarray  # (rows, W) int32, prim_id in each lane of the leaves' rows; -1 in an unused lane.
     leaves: int
     depth: int  # Number of nodes on the longest path from the root.
-    stack: int  # Largest number of entries on a traversal stack.
 
     @property
     def exists(self) -> np.ndarray:
@@ -57,12 +56,7 @@ def one_leaf(lo: np.ndarray, hi: np.ndarray, width: int) -> WideTree:
     if n:
         low[0, -1], high[0, -1] = lo[0], hi[0]
         children[0, -1], order[0, 0] = leaf_reference.func(0, 1), 0
-    return WideTree(low, high, children, order, n, 1, 0)
-
-
-def leaf_rows(references: np.ndarray) -> np.ndarray:
-    """Return the first row of each of the leaves' references, int64."""
-    return np.asarray(leaf_first.func(references.astype(np.int64)))
+    return WideTree(low, high, children, order, n, 1)
 
 
 def collapse_kernels() -> tuple[Kernel, ...]:
@@ -85,17 +79,16 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     trees = struct_record(build_wide.Subtrees, arrays)
     launch_raw(build_wide.subtree_costs, 1, tree.nodes, options, trees)
     children, (lo, hi) = np.empty(n * width, np.int32), np.empty((2, n * width, 3), np.float32)
-    source, order, count = np.empty(width, np.int32), np.empty(len(tree.order) * width, np.int32), np.zeros(5, np.int32)
+    source, order, count = np.empty(width, np.int32), np.empty(len(tree.order) * width, np.int32), np.zeros(4, np.int32)
     out = struct_record(build_wide.WideTree, (children, lo, hi, source, order, count))
     launch_raw(build_wide.collapse, 1, tree.nodes, tree.order, options, trees, out)
-    n_nodes, rows, leaves, depth, stack = count.tolist()
+    n_nodes, rows, leaves, depth = count.tolist()
     if rows > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}",
                          hint="use accel='bvh2'")
     used = n_nodes * width
     boxes = lo[:used].reshape(-1, width, 3).copy(), hi[:used].reshape(-1, width, 3).copy()
-    return WideTree(*boxes, children[:used].reshape(-1, width).copy(), order[: rows * width].reshape(-1, width).copy(), leaves, depth,
-                    stack)
+    return WideTree(*boxes, children[:used].reshape(-1, width).copy(), order[: rows * width].reshape(-1, width).copy(), leaves, depth)
 
 
 def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
@@ -111,7 +104,7 @@ def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
               for box, end in ((tree.lo, np.inf), (tree.hi, -np.inf)))
     children = packed(np.concatenate([np.full((n, missing), EMPTY), children], axis=1).astype(np.int32), width)
     lanes = lanes_of(children, tree.primitives.astype(np.int32), width)
-    return WideTree(lo, hi, children, lanes, int(leaf.sum()), len(tree.levels()), stack_need(children))
+    return WideTree(lo, hi, children, lanes, int(leaf.sum()), len(tree.levels()))
 
 
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:

@@ -99,7 +99,7 @@ def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: int = 32
     wide = collapse(build_binary(geometry, options, 1), width, max_leaf, 1.0, 1.0)
     if bits < 32:
         lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width) if bits == 8 else quantised(wide.lo, wide.hi, bits)[:2]
-        wide = WideTree(np.ascontiguousarray(lo), np.ascontiguousarray(hi), wide.children, wide.order, wide.leaves, wide.depth, wide.stack)
+        wide = WideTree(np.ascontiguousarray(lo), np.ascontiguousarray(hi), wide.children, wide.order, wide.leaves, wide.depth)
     return tree_of(geometry, wide)
 
 

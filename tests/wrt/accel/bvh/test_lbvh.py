@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
-import warp as wp
 
-import wrt
 from wrt.accel.bvh.builders import BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.geometry import Geometry
@@ -16,7 +14,7 @@ from wrt.accel.scenes.build import build
 from wrt.accel.store import check_binary
 from wrt.kernels.build.lbvh import KEY_BITS, bits_of
 from wrt.kernels.traverse.bvh2 import STACK_SIZE
-from wrt.scene.shapes import icosphere, torus
+from wrt.scene.shapes import torus
 
 FIELDS = "t", "u", "v", "prim_id"
 
@@ -84,16 +82,3 @@ def test_keys_leave_room_for_every_number() -> None:
         number, bits = bits_of(n)
         assert (n - 1) >> number == 0 and 1 <= bits <= 21 and number + 3 * bits <= KEY_BITS < STACK_SIZE
     assert bits_of(1_000_000) == (20, 14)
-
-
-def test_it_is_built_over_triangles_that_are_on_the_device() -> None:
-    mesh = icosphere(2)
-    points = wp.array(mesh.vertices, dtype=wp.vec3, device=DEVICE)
-    indices = wp.array(mesh.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
-    accel = build(wrt.DeviceGeometry(points, indices), "bvh2", builder="lbvh")
-    other = build(mesh, "bvh2", builder="lbvh")
-    assert accel.built.arrays["nodes"].tobytes() == other.built.arrays["nodes"].tobytes()
-    assert accel.stats.sah_cost == other.stats.sah_cost and accel.geometry.checksum() == other.geometry.checksum()
-    rays = np.random.default_rng(1).normal(size=(2, 500, 3)).astype(np.float32)
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(accel.closest_hit(*rays), name), getattr(other.closest_hit(*rays), name))

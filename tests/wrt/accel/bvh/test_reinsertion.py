@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wrt.accel.bvh import reinsertion
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.reinsertion import EVERY_NODE, LARGEST_NODES, Effort, half_areas, links_of, optimized, scale_of
 from wrt.accel.geometry import Geometry
@@ -45,19 +44,3 @@ def test_a_tree_that_cannot_gain_is_left_alone() -> None:
     geometry = Geometry.of(icosphere(4))
     refined, binned = (build_binary(geometry, BvhOptions(name), 1) for name in ("refined", "binned"))
     assert np.array_equal(refined.nodes, binned.nodes) and np.array_equal(refined.order, binned.order)
-
-
-def test_a_tree_that_would_be_too_deep_takes_fewer_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    tree = build_binary(room(), BvhOptions("binned", 1), 1)
-    depths = [int(optimized(tree, Effort(1.0, rounds, 0.0), 1)[1].depth[0]) for rounds in (0, 1, 2, 4)]
-    assert depths[0] == tree.depth
-    for limit in sorted(set(depths)):
-        monkeypatch.setattr(reinsertion, "STACK_SIZE", limit)
-        found = int(optimized(tree, Effort(1.0, 4, 0.0), 1)[1].depth[0])
-        allowed = [depth for depth in depths if depth <= limit]
-        assert found == (allowed[-1] if allowed else depths[0])
-
-
-def test_the_tree_is_the_same_for_any_number_of_threads() -> None:
-    one, two = (build_binary(room(), BvhOptions("refined"), threads) for threads in (1, 2))
-    assert np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.kernels.traverse.test_common import GEOMETRIES
-from tests.refused import refused
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.bvh.volumes import cuts, project
 from wrt.accel.geometry import Geometry
@@ -105,10 +104,3 @@ def test_denormal_meshes_are_hit_as_by_brute_force(name: str) -> None:
     assert (expected.prim_id >= 0).mean() > 0.5
     np.testing.assert_array_equal(hits.t, expected.t)
     np.testing.assert_array_equal(hits.prim_id, expected.prim_id)
-
-
-@pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
-def test_options_are_those_of_the_binary_tree(name: str) -> None:
-    assert build(BALL, name, max_leaf=1).stats.leaves == len(BALL.faces)
-    with refused("builder", "no builder"):
-        build(BALL, name, builder="guess")

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.refused import Refusal, refused
-from wrt.accel.bvh import wide
+from tests.refused import refused
 from wrt.accel.bvh.compress import compress, decompress
-from wrt.accel.bvh.wide_tree import check_wide, lanes_of, packed
+from wrt.accel.bvh.wide_tree import check_wide, lanes_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -112,15 +111,6 @@ def test_lanes_follow_the_leaves(width: int) -> None:
     assert np.array_equal(rows[3], order[width + 2 :])
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"max_leaf": 0}, ("max_leaf",)), ({"max_leaf": 65}, ("max_leaf",)), ({"cost_traversal": -1.0}, ("cost_traversal",)),
-    ({"builder": "nonsense"}, ("builder", "no builder")), ({"width": 3}, ("width", "no option")), ({"max_leaf": 2.5}, ("max_leaf",)),
-])
-def test_options_out_of_range_are_refused(options, message: Refusal) -> None:
-    with refused(*message):
-        build(BALL, "bvh8", **options)
-
-
 @pytest.mark.parametrize("name", [*WIDE, "bvh6"])
 def test_any_number_of_threads_makes_the_same_nodes_and_rows(name: str) -> None:
     ball = icosphere(6)  # more triangles than one job of a thread
@@ -134,14 +124,6 @@ def test_any_number_of_threads_makes_the_same_nodes_and_rows(name: str) -> None:
 def test_nodes_and_rows_begin_where_cache_lines_do(name: str) -> None:
     data = build(BALL, name).data
     assert data.nodes.ptr % 64 == 0 and data.primitives.ptr % 64 == 0
-
-
-def test_references_are_packed_by_rows_or_without_gaps() -> None:
-    children = np.array([[0, 1, -1 - (64 + 8), -1 - 0], [0, 0, -1 - (3 * 64 + 7), -1 - (4 * 64 + 2)]], np.int32)  # 9, 1, 8 and 3
-    dense = packed(children, 1)
-    assert dense.tolist() == [[0, 1, -1 - (64 + 8), -1 - 0], [0, 0, -1 - (10 * 64 + 7), -1 - (18 * 64 + 2)]]
-    check_wide(dense, 21, 1)
-    np.testing.assert_array_equal(packed(dense, 8), children)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1.0, 1e30])
@@ -186,10 +168,3 @@ def test_a_node_that_tells_of_other_children_is_refused() -> None:
     nodes[3, 3:4].view(np.uint32)[0] ^= np.uint32(1 << 31)
     with refused(what="children"):
         accel._check(accel.built)
-
-
-@pytest.mark.parametrize("name", ["bvh4", "bvh8", "bvh8c"])
-def test_large_meshes_get_the_same_rows_from_a_kernel(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    host = build(BALL, name, max_leaf=12).data.primitives.numpy()
-    monkeypatch.setattr(wide, "ROWS_BY_KERNEL", 0)
-    assert build(BALL, name, max_leaf=12).data.primitives.numpy().tobytes() == host.tobytes()
