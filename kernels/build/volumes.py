@@ -4,8 +4,7 @@ import warp as wp
 
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
-from wrt.kernels.traverse.bvh2_kdop import KdopNode
-from wrt.kernels.traverse.bvh2_sphere import SphereNode
+from wrt.kernels.traverse.bvh2_volumes import KdopNode, SphereNode
 
 ROUNDS = wp.constant(8)
 ROUND_UP = wp.constant(wp.float64(1.0 + 2.0**-22))

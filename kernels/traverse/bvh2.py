@@ -1,7 +1,7 @@
 """Traversal of the binary BVH from front to back, with a stack.
 A node holds the bounding volumes of both children, so that one fetch serves two tests. The walk visits the nearer child at once, and pushes
-the farther child. It drops a popped node that begins behind the closest hit. The volumes are boxes here, spheres in `bvh2_sphere.py`, and
-14-DOPs in `bvh2_kdop.py`."""
+the farther child. It drops a popped node that begins behind the closest hit. The volumes are boxes here, spheres and 14-DOPs in
+`bvh2_volumes.py`."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,7 +18,6 @@ from wrt.kernels.units.box import BoxRay
 
 # Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
 STACK_SIZE = 64
-ENTRY = 12  # size of a stack entry in bytes: a key of 8 and a count of 4
 
 
 @wp.struct
@@ -139,8 +138,8 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     observe, observe_node = make_observer(units, 0), make_observe_node(units, volumes)
     # A stack entry is a key (entry distance, and inner node or first primitive) and the child's `count`.
-    new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
-    new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
+    new_keys, put_key, key_at = make_stack(STACK_SIZE, wp.uint64)
+    new_counts, put_count, count_at = make_stack(STACK_SIZE, wp.int32)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
@@ -149,9 +148,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
         best = no_hit(ray)
         end = best.t
         keys = new_keys()
-        first_keys = shared_keys()
         sizes = new_counts()
-        first_sizes = shared_counts()
         size = int(0)
         first = int(0)
         if wp.static(root is not None):
@@ -178,8 +175,8 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                     if hit_0 and hit_1:
                         far = child_of(node, not second)
                         t = wp.where(second, entry[0], entry[1])
-                        put_key(keys, first_keys, size, key_of(t, far.first))
-                        put_count(sizes, first_sizes, size, far.count)
+                        put_key(keys, size, key_of(t, far.first))
+                        put_count(sizes, size, far.count)
                         size = size + 1
                         observe.push(accel.recorder, ray, far.first, step_count(far.count), t, size - 1, size)
                     near = child_of(node, second)
@@ -190,10 +187,10 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                key = key_at(keys, first_keys, size)
+                key = key_at(keys, size)
                 found = t_of(key) <= end
                 first = reference_of(key)
-                count = count_at(sizes, first_sizes, size)
+                count = count_at(sizes, size)
                 observe.pop(accel.recorder, ray, first, step_count(count), t_of(key), wp.where(found, ENTERED, 0))
             if not found:
                 break

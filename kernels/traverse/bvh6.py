@@ -111,14 +111,13 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     observe, enter_children = make_observer(units, size_of(Bvh6Node)), make_enter_children(units)
-    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
+    new_stack, put, get = make_stack(STACK_SIZE, wp.uint64)
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
         stack = new_stack()
-        shared = shared_stack()
         size = int(0)
         current = int(0)
         while True:
@@ -134,7 +133,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 entered, n = enter_children(accel.recorder, probe, node, children, best.t)
                 if n > 0:
                     for j in range(n - 1):
-                        put(stack, shared, size, entered[j])
+                        put(stack, size, entered[j])
                         child = reference_of(entered[j])
                         size = size + 1
                         observe.push(accel.recorder, ray, index_of(child), count_of(child), t_of(entered[j]), size - 1, size)
@@ -144,7 +143,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
-                key = get(stack, shared, size)
+                key = get(stack, size)
                 found = t_of(key) <= best.t
                 current = reference_of(key)
                 observe.pop(accel.recorder, ray, index_of(current), count_of(current), t_of(key), wp.where(found, ENTERED, 0))

@@ -20,7 +20,6 @@ class Units(NamedTuple):
     instances: bool = False  # True if the structure is placed by instances: Ray.first_prim is added to each prim_id.
     resumes: bool = False  # True to resume behind a hit: a hit at t_min counts only if prim_id >= Ray.slot. No spheres.
     lists: bool = False  # True to list all hits (kernels.hit_lists) instead of the best hit.
-    stack: str = "local"  # Name in kernels.traverse.stack.PLACES: where the stack is, in the structures that support the choice.
 
     @property
     def triangle_test(self) -> Any:

@@ -204,6 +204,5 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return ray.first_prim
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root=root)
-    # This walk must not use shared memory: it continues after the lower walk, which may overwrite the entries.
     visit_leaf = make_placed_leaf(units, any_hit, bottom, struct)
-    return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, visit_leaf, any_hit)
+    return make_binary_traversal(units._replace(instances=False), volumes, visit_leaf, any_hit)

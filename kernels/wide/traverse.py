@@ -215,7 +215,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
     prefetch_next = make_prefetch(units.triangle_test.record, layout)
     observe_node, observe_push, observe_pop = make_observed(units, layout)
     visit_leaf = make_leaf_test(units, any_hit, accepts, layout)
-    new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
+    new_stack, put, get = make_stack(STACK_SIZE, wp.uint64)
     entries = stack_type(wp.uint64)
 
     @wp.func
@@ -226,12 +226,12 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         return reference
 
     @wp.func
-    def pop(recorder: Recorder, ray: Ray, stack: wp.ref[entries], shared: wp.uint64, size: int, best: Hit):
+    def pop(recorder: Recorder, ray: Ray, stack: wp.ref[entries], size: int, best: Hit):
         """Return the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id."""
         reference = int(DONE)
         while size > 0 and reference == DONE:
             size = size - 1
-            key = get(stack, shared, size)
+            key = get(stack, size)
             observe_pop(recorder, ray, key, t_of(key) <= best.t)
             if t_of(key) <= best.t:
                 reference = reference_of(key)
@@ -244,7 +244,6 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         best = no_hit(ray)
         best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # Finite, so that the ray enters no box that begins at infinity.
         stack = new_stack()
-        shared = shared_stack()
         size = int(0)
         reference = int(0)
         while reference != DONE:
@@ -261,7 +260,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         key = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))
                         if wp.static(any_hit):
                             observe_push(accel.recorder, ray, near, size, size + 1)
-                            put(stack, shared, size, near)
+                            put(stack, size, near)
                             near = key
                         else:
                             far = wp.max(near, key)
@@ -269,23 +268,23 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                             # Most nodes push two or three entries, so this does not sort them fully: the nearest pushed so far is on top.
                             below = int(size)
                             if size > begin:
-                                under = get(stack, shared, size - 1)
+                                under = get(stack, size - 1)
                                 below = wp.where(far < under, size, size - 1)
-                                put(stack, shared, size, wp.min(far, under))
-                                put(stack, shared, size - 1, wp.max(far, under))
+                                put(stack, size, wp.min(far, under))
+                                put(stack, size - 1, wp.max(far, under))
                             else:
-                                put(stack, shared, size, far)
+                                put(stack, size, far)
                             observe_push(accel.recorder, ray, far, below, size + 1)
                         size = size + 1
                     reference = reference_of(near)
                 else:
-                    reference, size = pop(accel.recorder, ray, stack, shared, size, best)
+                    reference, size = pop(accel.recorder, ray, stack, size, best)
             if reference != DONE:
                 best = visit_leaf(accel, surfaces, reference, probe, rows, best)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         return finish(accel.recorder, ray, best)
-                reference, size = pop(accel.recorder, ray, stack, shared, size, best)
+                reference, size = pop(accel.recorder, ray, stack, size, best)
         return finish(accel.recorder, ray, best)
 
     return traverse

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar, get_type_hints
 
-from wrt.core import settings
 from wrt.core.checks import accepts, did_you_mean, shown
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
@@ -27,11 +26,6 @@ ACCELERATORS: Registry[type[Any]] = Registry("structure", {
     "grid": "wrt.accel.cells.grid:Grid",
     "octree": "wrt.accel.cells.trees:Octree",
 }, "wrt.structures", type)
-
-
-def stack_on(device: str) -> str:
-    """Return where kernels on a device have their traversal stacks: a name in kernels.traverse.stack.PLACES."""
-    return "local" if device == "cpu" else settings.stack  # a CPU has no other place
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.snapshot import Structure
-from wrt.accel.structures import ACCELERATORS, stack_on
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
 from wrt.core.types import Device, JsonObject, Kernel, WarpStruct
@@ -147,7 +147,7 @@ def plan_of(scene: Scene, options: Options) -> Plan:
     scene, camera = moved_by(scene, origin), moved_camera(camera, origin)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
-    units = Units(options.triangle, options.box, features.spheres, instances=features.instances, stack=stack_on(options.device))
+    units = Units(options.triangle, options.box, features.spheres, instances=features.instances)
     return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
                 _crop(scene.settings, options), scene.settings.max_depth, origin)
 

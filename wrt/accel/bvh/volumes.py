@@ -14,9 +14,8 @@ from wrt.accel.store import check_links
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.types import WarpType
 from wrt.kernels.build import volumes as fits
-from wrt.kernels.traverse import bvh2_kdop as traverse_bvh2_kdop
-from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
-from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.traverse.bvh2_volumes import KDOPS, SPHERES, KdopNode, SphereNode
 from wrt.kernels.units.kdop import KDOP_PAD
 
 NODES_PER_LAUNCH = 512
@@ -42,7 +41,7 @@ class Bvh2Sphere(VolumeBvh):
     """A binary BVH of bounding spheres around the primitives' padded boxes. Options: BinaryOptions."""
 
     name = "bvh2_sphere"
-    kernels = traverse_bvh2_sphere
+    kernels = SPHERES
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         spheres = fit_spheres(nodes, order, self.geometry, self.threads)
@@ -55,7 +54,7 @@ class Bvh2Sphere(VolumeBvh):
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]
         empty = [nodes[f"sphere_{side}"][:, 3] < 0.0 for side in "01"]
-        check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
+        check_links(nodes, empty, len(built.order), STACK_SIZE)
 
 
 class Bvh2Kdop(VolumeBvh):
@@ -66,7 +65,7 @@ class Bvh2Kdop(VolumeBvh):
     """
 
     name = "bvh2_kdop"
-    kernels = traverse_bvh2_kdop
+    kernels = KDOPS
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         middle = middle_of(nodes)
@@ -98,7 +97,7 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
     """Make a SphereNode record for each Bvh2Node record, with spheres around the padded boxes of the primitives below."""
     cpu = start("cpu")
     lo, hi = geometry.bounds()
-    out = upload(with_common_fields(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
+    out = upload(with_common_fields(SphereNode, nodes), SphereNode, cpu)
     spans = upload(np.stack(spans_of(nodes), axis=1), wp.vec2i, cpu)
     launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans, upload(order.copy(), wp.int32, cpu),
            upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
@@ -141,6 +140,6 @@ def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: 
     """Make a KdopNode record for each Bvh2Node record, with 14-DOPs around the primitives below."""
     cpu = start("cpu")
     cut_lo, cut_hi = cuts(geometry, middle)
-    out = upload(with_common_fields(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
+    out = upload(with_common_fields(KdopNode, nodes), KdopNode, cpu)
     launch(fits.fit_kdops, 1, upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu), upload(cut_hi, wp.vec4, cpu), out)
     return on_host(out)

@@ -13,7 +13,6 @@ from wrt.accel.queries.rays import Rays, constant, rays_on
 from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
-from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
 from wrt.core.threads import FreeList, run_all, thread_count
@@ -285,9 +284,8 @@ def rays_on_gpu(n: int, device: Device) -> int:
 
 def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
     """Trace on a GPU, as trace_query does: rays in Warp arrays in one launch, rays in NumPy arrays in parts."""
-    device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
-    structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
-    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
+    device, rays, out = snapshot.device, query.rays, query.out
+    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(snapshot.structure)
     n = len(out[0])
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
