@@ -49,7 +49,7 @@ whatif, stability = measured(WhatIf), measured(Stability)
 @click.option("--spp", type=int, default=1, show_default=True, help="Samples per pixel")
 @shared("max_depth", "assignments", "crop", "camera", "accel", "seed", "threads")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help=MODELLED)
-@reporting("Folder for heat maps, EXR layers, histograms and a report")
+@reporting("Folder for heat maps, EXR layers and a report")
 def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **options: Parsed) -> None:
     """Count the work of the rays of SCENE, and model an RT core. Count by pixel, kind of ray and depth; estimate the time on the core."""
     from wrt.core.checks import require_known

@@ -19,9 +19,7 @@ def from_inside() -> bool:
 
 @dataclass(frozen=True)
 class RtCore(Plan):
-    """Model the RT core on MESHES. Find what limits it, a range of rays a second, and which assumption changes that range most.
-
-    A trace that --trace or wrt.trace wrote (.npz) can stand in place of a mesh."""
+    """Model the RT core on MESHES. Find what limits it, a range of rays a second, and which assumption changes that range most."""
 
     COMMAND, STUDY, QUICK = "bench rtcore", "wrt.lab.rtcore.meshes", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
@@ -31,7 +29,6 @@ class RtCore(Plan):
     gpu: str = the_gpu()
     seed: int = the_seed()
     inside: bool = from_inside()
-    trace: str = option("", "Write the trace of one mesh, structure and kind of ray to a .npz file  [default: none]")
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class WhatIf(Plan):
     """Change one part of the RT core's design, and compare costs. Both designs trace the same rays through MESH.
 
     STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
-    "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays. "rates": tests a clock."""
+    "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays."""
 
     COMMAND, STUDY, QUICK = "whatif", "wrt.lab.rtcore.whatif", {"rays": 1 << 12}
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from pathlib import Path
 
 import numpy as np
 
@@ -12,17 +11,13 @@ from wrt.accel.bvh.wide import CollapsedBvh
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.errors import InputError
-from wrt.core.files import check_writable
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, mesh_name, tabled
 from wrt.lab.rtcore import RtCore as Plan
 from wrt.lab.rtcore.model import LEGEND as LEGEND
-from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, parameters, simt, trace_rays
+from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.trace import Trace
-from wrt.lab.rtcore.trace import trace as record
 from wrt.lab.rtcore.warps import WARP, blocks
 from wrt.scene.mesh import Mesh
 
@@ -49,35 +44,13 @@ def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
 TITLE = "The model of the RT core on meshes"
 COLUMNS: Columns = {
     "structure": "{structure}", "rays": "{name}",
-    "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}" if row.mesh_triangles else "",
+    "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
     **{head: column for head, column in MODEL_COLUMNS.items() if head != "rays"},
     "SIMT efficiency": "{simt_efficiency[as they come]:.0%}", "if sorted": "{simt_efficiency[sorted]:.0%}"}
 
 
-def check_trace(plan: Plan) -> None:
-    """Raise InputError unless plan.trace is empty, or a file that can be written, for one mesh, structure and kind of ray."""
-    if not plan.trace:
-        return
-    if len(plan.meshes) != 1 or len(plan.structures) != 1 or len(plan.kinds) != 1:
-        raise InputError("a file has one trace: give one mesh, one structure and one kind of ray", argument="trace")
-    if Path(plan.trace).suffix.lower() != ".npz":
-        raise InputError("the file of a trace must have the suffix .npz", path=plan.trace)
-    check_writable(plan.trace)
-
-
-def trace_rows(plan: Plan, path: Path) -> list[Row]:
-    trace = Trace.load(path)
-    work = trace.work("trace")
-    return [model_row(work, GPUS[plan.gpu], simt(work.counters.counts, work.warp, trace.origin, trace.direction), mesh=mesh_name(path),
-                      mesh_triangles=0, structure=trace.structure, bytes=0)]
-
-
 def groups(plan: Plan) -> Groups:
-    check_trace(plan)
     for path in plan.meshes:
-        if isinstance(path, str | Path) and Path(path).suffix.lower() == ".npz":
-            yield partial(trace_rows, plan, Path(path))
-            continue
         mesh = as_mesh(path)
         names = list(dict.fromkeys(plan.structures)) or bvhs()
         rays = cache(partial(mesh_rays, plan, mesh, names[0]))
@@ -94,12 +67,7 @@ def structure_rows(plan: Plan, mesh: Mesh, structure: str, rays_by_kind: Callabl
     geometry, out = Geometry.of(mesh), []
     accel = build(geometry, structure)
     for rays in (rays_by_kind()[kind] for kind in plan.kinds):
-        if plan.trace:
-            recorded = record(accel, rays.origins, rays.directions, t_max=rays.t_max)
-            recorded.save(plan.trace)
-            work = recorded.work(rays.kind)
-        else:  # shadow rays also search the closest hit
-            work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)
+        work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)  # shadow rays also search the closest hit
         efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
         out.append(model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh), mesh_triangles=len(geometry),
                              structure=structure, bytes=accel.stats.bytes))
@@ -107,7 +75,6 @@ def structure_rows(plan: Plan, mesh: Mesh, structure: str, rays_by_kind: Callabl
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return a table for each mesh, and the table of the model's parameters."""
-    tables = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles" if triangles else f"Trace {mesh}")
-              for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
-    return [*tables, parameters()]
+    """Return a table for each mesh."""
+    return [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
+            for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]

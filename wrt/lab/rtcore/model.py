@@ -15,9 +15,9 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.queries.answers import Counters
 from wrt.core.types import ArrayLike
-from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
+from wrt.lab.bench.report import Columns, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, Prefetches, first_level, second_level
-from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
+from wrt.lab.rtcore.parameters import BASE, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
@@ -141,8 +141,8 @@ MODEL_COLUMNS: Columns = {
 SIMT_COLUMNS: Columns = {"rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
 LEGEND = f"""\
 nodes, boxes, triangles: fetched or tested; lines: cache lines that the warps access. {", ".join(TERMS)}: clocks of an RT core per ray that
-this part alone needs; in brackets its use while the slowest part (limit) is fully used. Grays/s: under the assumptions in the table of
-parameters (Turing: 4 boxes or 1 triangle a clock; 4 warps at a time, L2 empty at first). range: over {", ".join(RANGE)} =
+this part alone needs; in brackets its use while the slowest part (limit) is fully used. Grays/s: under the assumptions in
+wrt/lab/rtcore/parameters.py (Turing: 4 boxes or 1 triangle a clock; 4 warps at a time, L2 empty at first). range: over {", ".join(RANGE)} =
 {"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that change Grays/s most
 if each varies alone, with the factor from lowest to highest. Nothing here is measured: NVIDIA has not published Turing's rates and node
 format."""
@@ -164,8 +164,3 @@ def model_page(rows: Sequence[Row]) -> str:
     """Return the tables of the model and of SIMT efficiency as HTML."""
     gpu = rows[0].gpu if rows else "a GPU"
     return tables_page([tabled(MODEL_COLUMNS, rows, f"Model of {gpu}"), tabled(SIMT_COLUMNS, rows, "SIMT efficiency")])
-
-
-def parameters() -> Part:
-    """Return the table of the model's parameters."""
-    return Part("The parameters of the model", "", ("parameter", "value", "status", "values in sweeps", "source"), PARAMETERS)

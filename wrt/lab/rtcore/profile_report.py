@@ -1,4 +1,4 @@
-"""Report of `profile`: tables, the model of the RT core, heat maps, EXR layers and histograms."""
+"""Report of `profile`: tables, the model of the RT core, heat maps and EXR layers."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -10,7 +10,6 @@ from wrt.accel.queries.answers import Counters
 from wrt.core.errors import InputError
 from wrt.core.files import check_writable, write_bytes
 from wrt.core.tables import Rows
-from wrt.lab.bench.plot import histograms, new_figure
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
 from wrt.lab.rtcore.parameters import Gpu
@@ -58,7 +57,7 @@ def work_of(profile: Profile, group: str) -> Work | None:
 
 
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
-LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
+LAYERS, REPORT = "counters.exr", "profile.md"
 DEPTHS: Columns = {
     "depth": "{depth}", "kind": "{kind}", "rays": "{probes}", "hits": lambda row: f"{row.hits / row.probes:.0%}",
     **{head: partial(lambda row, name: f"{getattr(row, name) / row.probes:.1f}", name=name) for head, name in
@@ -71,16 +70,13 @@ def percentiles(profile: Profile) -> Part:
     """Return the table of mean and percentiles of each counter over the rays, by kind of ray."""
     lines = []
     for name in PER_RAY:
-        for kind, values in by_kind(profile, name).items():
-            shares = np.percentile(values, (50, 90, 99, 99.9))
-            lines.append((TITLES[name], kind, f"{values.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{values.max()}"))
+        values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
+        for i, kind in enumerate(KINDS):
+            chosen = values[profile.rays.kind == i]
+            if len(chosen):
+                shares = np.percentile(chosen, (50, 90, 99, 99.9))
+                lines.append((TITLES[name], kind, f"{chosen.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{chosen.max()}"))
     return Part("Cost per ray", "", ("counter", "rays", "mean", "50%", "90%", "99%", "99.9%", "largest"), lines)
-
-
-def by_kind(profile: Profile, name: str) -> dict[str, np.ndarray]:
-    """Return kind of ray -> values of a counter, for the kinds that occur."""
-    values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
-    return {kind: values[profile.rays.kind == i] for i, kind in enumerate(KINDS) if (profile.rays.kind == i).any()}
 
 
 def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
@@ -111,26 +107,20 @@ def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
 
 
 def check_folder(folder: Path) -> None:
-    """Create the folder if it is missing. Raise InputError if write_report cannot write to it, or if matplotlib is missing."""
+    """Create the folder if it is missing. Raise InputError if write_report cannot write to it."""
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be used as the output folder: {error.strerror}", path=folder) from error
-    for name in (LAYERS, HISTOGRAMS):
-        check_writable(folder / name)
-    new_figure(1.0, 1.0)
+    check_writable(folder / LAYERS)
 
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
-    """Write heat maps, EXR layers, histograms and the report `text`; return their paths. Raise InputError if a file cannot be written."""
-    paths = []
-    for name in PICTURES:
-        if profile.maps[name].any():
-            paths.append(folder / f"{name}.png")
-            write_codes(paths[-1], np.asarray(profile.heatmap(name)))
+    """Write heat maps, EXR layers and the report `text`; return their paths. Raise InputError if a file cannot be written."""
+    heat_maps = {folder / f"{name}.png": name for name in PICTURES if profile.maps[name].any()}
+    for path, name in heat_maps.items():
+        write_codes(path, np.asarray(profile.heatmap(name)))
     write_exr(folder / LAYERS, {name: profile.maps[name].astype(np.float32) for name in PICTURES},
               {"scene": profile.scene, "spp": profile.spp})
-    kinds = {TITLES[name]: by_kind(profile, name) for name in PER_RAY}
-    write_codes(folder / HISTOGRAMS, histograms(kinds, f"{profile.scene}: distribution of the cost per ray"))
     write_bytes(folder / REPORT, f"# Profile of {text}".encode())
-    return [*paths, folder / LAYERS, folder / HISTOGRAMS, folder / REPORT]
+    return [*heat_maps, folder / LAYERS, folder / REPORT]

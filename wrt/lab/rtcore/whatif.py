@@ -20,11 +20,11 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study, child_0_first
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, mesh_name, tabled
+from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
 from wrt.lab.bench.report import run as run
 from wrt.lab.rtcore import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
-from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
+from wrt.lab.rtcore.model import Work, predict, simt
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
 
@@ -103,18 +103,12 @@ COLUMNS: Columns = {
     f"limit, {BASE.warps} warps": "{few_warps.limit}",
     f"Grays/s, {MANY_WARPS.warps} warps": lambda row: f"{row.many_warps.rays_per_second / 1e9:.2f}",
     f"limit, {MANY_WARPS.warps} warps": "{many_warps.limit}", "differ": "{differ}"}
-RATES: Columns = {
-    "structure": "{structure}", "rays": "{kind}", "boxes/clock": "{boxes:g}", "triangles/clock": "{triangles:g}",
-    "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}", "limit": "{limit}",
-    **{name: f"{{clocks[{name}]:.3g}}" for name in TERMS}, "twice the triangles": "{doubled:.2f}x"}
 LEGEND = f"""\
 B/ray: bytes of nodes and triangles that a ray fetches. lines/ray: cache lines that its warp accesses. L1 misses: share of the lines that
 miss the L1. SIMT efficiency: share of the lanes' time that rays use. Grays/s: predicted with {BASE.boxes:g} boxes and
 {BASE.triangles:g} triangle a clock, for {BASE.warps} warps at a time in each RT core and an L2 that is empty at first, and for
 {MANY_WARPS.warps} warps and an L2 that has seen the same rays. limit: the largest term of the model. Predictions serve to compare
-variants. differ: rays whose hit is not that of the first variant; must be 0. Study of rates: {", ".join(TERMS)} are clocks of an RT core
-per ray, for {MANY_WARPS.warps} warps and an L2 that has seen the same rays. twice the triangles: factor on Grays/s if the rate of triangle
-tests doubles."""
+variants. differ: rays whose hit is not that of the first variant; must be 0."""
 
 
 @dataclass(frozen=True)
@@ -177,9 +171,8 @@ def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
         yield replace(variant, prim_id=variant.prim_id[back], t=variant.t[back])
 
 
-# The study "rates" applies the model with other test rates to the variants of "width".
 STUDIES: dict[str, Callable[[Bvh2, RaySet], Iterator[Variant]]] = {
-    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": width}
+    "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting}
 
 
 def groups(plan: Plan) -> Groups:
@@ -193,7 +186,7 @@ def kind_rows(plan: Plan, kind: str) -> list[Row]:
     out: list[Row] = []
     for variant in STUDIES[plan.study](tree, rays):
         first = first or variant
-        out += rate_rows(variant, kind, GPUS[plan.gpu]) if plan.study == "rates" else [row_of(variant, first, kind, GPUS[plan.gpu])]
+        out.append(row_of(variant, first, kind, GPUS[plan.gpu]))
     return out
 
 
@@ -206,28 +199,6 @@ def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
                triangles=work.mean("primitives"), bytes=work.mean("node_bytes") + work.mean("primitive_bytes"),
                lines=misses.accesses / len(work), l1_missed=misses.l1 / max(misses.accesses, 1), simt=busy,
                differ=int(differ.sum()), few_warps=predict(work, gpu), many_warps=predict(work, gpu, MANY_WARPS))
-
-
-def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
-    """Yield a prediction for every pair of box and triangle rates, with MANY_WARPS, where the rates matter most.
-    doubled: factor on the rays a second if the triangle rate doubles."""
-    work = Work(variant.name, variant.counters, packed(len(variant.rays)))
-    for core in variants(MANY_WARPS, ("boxes", "triangles")):
-        now, twice = predict(work, gpu, core), predict(work, gpu, replace(core, triangles=2.0 * core.triangles))
-        yield Row(structure=variant.name, kind=kind, boxes=core.boxes, triangles=core.triangles, **vars(now),
-                  doubled=twice.rays_per_second / now.rays_per_second)
-
-
-def line(row: Row) -> str:
-    return "  ".join(cells(columns(row), row))
-
-
-def columns(row: Row) -> Columns:
-    return RATES if "doubled" in vars(row) else COLUMNS
-
-
-def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    return [tabled(columns(rows[0]), rows, f"What if: {plan.study}, {mesh_name(plan.mesh)}")]
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:

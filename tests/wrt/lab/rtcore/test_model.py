@@ -12,7 +12,7 @@ from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE, Counts
 from wrt.lab.rtcore.caches import LINE, Cache
 from wrt.lab.rtcore.model import TERMS, Work, predict, sensitivity, simt, span, sweep, trace_rays
-from wrt.lab.rtcore.parameters import ASSUMED, DERIVED, GPUS, PARAMETERS, PUBLISHED, SWEEPS, Core, Gpu
+from wrt.lab.rtcore.parameters import GPUS, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import packed
 from wrt.scene.shapes import icosphere
 
@@ -91,14 +91,7 @@ def test_a_structure_on_a_gpu() -> None:
 
 
 def test_published_numbers() -> None:
-    """The claim of 10 Grays/s is 10.5 clocks a ray and core; 1.1 Grays/s in software are 5154 instructions of a lane."""
+    """The claim of 10 Grays/s is 10.5 clocks a ray and core."""
     gpu = GPUS["rtx2080ti"]
     assert gpu.sms * gpu.clock / 10e9 == pytest.approx(10.5, abs=0.01)
     assert gpu.l2.size == 5632 * 1024 and gpu.l1.size == 96 * 1024
-    values = {name: value for name, value, *_ in PARAMETERS}
-    assert float(values["RTX 2080 Ti: clocks a ray and RT core"]) == pytest.approx(68 * 1.545 / 10, abs=0.01)
-    assert float(values["GTX 1080 Ti: instructions of a lane a ray"]) == pytest.approx(28 * 128 * 1.582 / 1.1, abs=0.5)
-    assert {parameter[2] for parameter in PARAMETERS} == {PUBLISHED, DERIVED, ASSUMED}
-    assert all(parameter[4] for parameter in PARAMETERS)
-    base = vars(Core())
-    assert all(base[name] in values for name, values in SWEEPS.items())

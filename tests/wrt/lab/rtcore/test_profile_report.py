@@ -11,7 +11,6 @@ import pytest
 from tests.command_line import wrt as command
 from tests.refused import refused
 from tests.wrt.lab.rtcore.test_profiler import MIRRORS
-from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.profile_report import GROUPS, model_rows, warp_order, work_of
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
@@ -95,14 +94,6 @@ def test_the_colours_of_a_heat_map_are_its_values() -> None:
     assert (heatmap(np.zeros((4, 4)), "nothing")[40:500, 20:480] == colors()[0]).all()
 
 
-def test_histograms_are_drawn_of_anything() -> None:
-    rng = np.random.default_rng(1)
-    assert bins({"a": np.zeros(5)}).tolist() == [0, 1] and (np.diff(bins({"a": np.array([1000])})) == 17).all()
-    kinds = {"primary": rng.geometric(0.1, 1000), "shadow": np.zeros(3, int)}
-    picture = histograms({"nodes": kinds, "stack": kinds, "one more": {"none": np.zeros(0)}}, "what a ray costs")
-    assert picture.shape == (550, 800, 3) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
-
-
 def test_the_command_writes_what_it_says(tmp_path: Path, measured: Profile) -> None:
     scene, folder = tmp_path / "mirrors.toml", tmp_path / "out"
     scene.write_text(MIRRORS)
@@ -112,7 +103,7 @@ def test_the_command_writes_what_it_says(tmp_path: Path, measured: Profile) -> N
         assert words in result.out
     written = {path.name for path in folder.iterdir()}
     assert written == {f"{name}.png" for name in PICTURES if measured.maps[name].any()} | {
-        "counters.exr", "histograms.png", "profile.md"}
+        "counters.exr", "profile.md"}
     layers = read_channels(folder / "counters.exr")
     for name in PICTURES:
         np.testing.assert_allclose(layers[name], measured.maps[name], rtol=1e-6)
