@@ -40,7 +40,7 @@ def inspect(scene: Path, output: Path | None, assignments: Assignments, quiet: b
 @click.command()
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("--ray", required=True, help="Origin and direction, six numbers: ox,oy,oz,dx,dy,dz")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Also write .gif, .mp4, .png, .json or .txt; a{}.png: all steps")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Also write .gif, .png, .json or .txt")
 @shared("accel", "as_json")
 def walk(mesh: Path, ray: str, output: Path | None, accel: str, as_json: bool) -> None:
     """List the steps of one ray through a structure over MESH. Steps are nodes, boxes, planes, stack, and triangle tests."""

@@ -3,7 +3,8 @@
 The x axis is the ray itself. The y axis is at right angles to it, and as close as possible to the coordinate axis that the ray follows
 least."""
 
-from collections.abc import Iterator
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +15,12 @@ from wrt.core.errors import InputError
 from wrt.core.files import check_writable, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
-from wrt.lab.walk.record import Region, WalkRecord
 from wrt.renderer.inspector.section import Plane, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from wrt.lab.walk.walk import Region, Walk
 
 COLORS = {"entered": "tab:green", "missed": "tab:red", "taken": "tab:green", "dropped": "tab:red", "visited": "0.75", "stack": "tab:blue"}
 MOST_FACES = 100_000  # the sections of larger meshes are not drawn
@@ -66,7 +68,7 @@ def clipped(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarra
     return np.array(out) if out else empty()
 
 
-def section_of(walk: WalkRecord) -> Section:
+def section_of(walk: Walk) -> Section:
     """Choose the plane, and a window around the mesh's box and the ray's origin or, if that is far, the ray's part near the box."""
     direction = walk.direction.astype(np.float64)
     length = float(np.linalg.norm(direction))
@@ -84,7 +86,7 @@ def section_of(walk: WalkRecord) -> Section:
     return Section(plane, length, (x0 - 0.05 * size, x1 + 0.05 * size, y0 - 0.05 * size, y1 + 0.05 * size))
 
 
-def draw(walk: WalkRecord, axes: "Axes | None", step: int | None) -> "Axes":
+def draw(walk: Walk, axes: Axes | None, step: int | None) -> Axes:
     """Draw the walk up to a step. Green: entered; red: missed; grey: visited nodes; blue: entries of the stack; black: tested triangles."""
     if axes is None:
         with needed_by("a drawing"):
@@ -116,7 +118,7 @@ def draw(walk: WalkRecord, axes: "Axes | None", step: int | None) -> "Axes":
     return axes
 
 
-def draw_regions(walk: WalkRecord, axes: "Axes", section: Section, last: int) -> None:
+def draw_regions(walk: Walk, axes: Axes, section: Section, last: int) -> None:
     """Draw the sections of all visited nodes, of the stack's entries, and of the step `last`."""
     regions, steps = walk.regions, walk.steps
     outlines: list[tuple[Region | None, dict[str, Any]]] = []
@@ -147,46 +149,29 @@ def segments_of(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return padded[:, 0], padded[:, 1]
 
 
-def frames(walk: WalkRecord) -> Iterator[tuple[int, Any]]:
-    """Yield each step and its figure; one figure serves all steps."""
+def write_picture(walk: Walk, path: PathLike, fps: int) -> None:
+    """Write an animation (.gif) or a picture (.png), as Walk.save describes."""
+    target = as_path(path, "path")
+    suffix = target.suffix.lower()
+    if suffix not in (".gif", ".png"):
+        raise InputError("must have the suffix .gif, .png, .json or .txt", path=path)
+    if not len(walk):
+        raise InputError("there is no step to draw: the ray tests nothing", path=path)
+    as_integer(fps, "fps", 1, 60)
+    check_writable(target)
     with needed_by("a drawing"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from PIL import Image
     figure = Figure(figsize=(7.0, 5.0), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    for step in range(len(walk)):
+    canvas, frames = FigureCanvasAgg(figure), []
+    for step in range(len(walk)) if suffix == ".gif" else [len(walk) - 1]:
         figure.clear()
         draw(walk, figure.subplots(), step)
-        yield step, figure
-
-
-def write_frames(walk: WalkRecord, path: PathLike, fps: int) -> None:
-    """Write an animation (.gif, .mp4) or pictures (.png), as Walk.save describes."""
-    target = as_path(path, "path")
-    suffix = target.suffix.lower()
-    if suffix not in (".gif", ".mp4", ".png"):
-        raise InputError("must have the suffix .gif, .mp4, .png, .json or .txt", path=path)
-    if not len(walk):
-        raise InputError("there is no step to draw: the ray tests nothing", path=path)
-    if suffix == ".png":
-        several = "{}" in target.name
-        for step, figure in frames(walk):
-            if several or step == len(walk) - 1:
-                with replacing(target.with_name(target.name.replace("{}", f"{step:0{len(str(len(walk) - 1))}}"))) as file:
-                    figure.savefig(file, format="png")
-        return
-    as_integer(fps, "fps", 1, 60)
-    check_writable(target)
-    with needed_by("an animation"):
-        from matplotlib import animation
-    if suffix == ".mp4" and not animation.writers.is_available("ffmpeg"):
-        raise InputError("a .mp4 file needs the program ffmpeg", path=path, hint="write a .gif file")
-    writer = animation.PillowWriter(fps=fps) if suffix == ".gif" else animation.FFMpegWriter(fps=fps)
+        canvas.draw()
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     with replacing(target) as file:
-        begun = False
-        for _, figure in frames(walk):
-            if not begun:
-                writer.setup(figure, file.name, dpi=100)
-                begun = True
-            writer.grab_frame()
-        writer.finish()
+        if suffix == ".png":
+            frames[0].save(file, format="png")
+        else:
+            frames[0].save(file, format="gif", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)

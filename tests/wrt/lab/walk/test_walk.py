@@ -15,7 +15,7 @@ from tests.structures import STRUCTURES, families_first
 from wrt.accel.queries.observed import RecordedSteps, record_steps
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.drawing import section_of
-from wrt.lab.walk.record import Entry, Region
+from wrt.lab.walk.walk import Entry, Region
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene, Sphere
