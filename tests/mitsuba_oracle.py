@@ -1,4 +1,4 @@
-"""Mitsuba 3 as an independent oracle: render and trace the scenes, rays and cameras of wrt."""
+"""Mitsuba 3 as an independent oracle: render the scenes of wrt, and trace their camera rays."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.mitsuba_whitted import whitted
-from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba, translate
 from wrt.renderer.upload import camera_rays
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.materials import Material
-from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 
 
@@ -49,38 +47,6 @@ def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, *
                              for index in range(passes)])
     variance = pictures.var(axis=0, ddof=1) / passes if passes > 1 else None
     return Rendering(pictures.mean(axis=0).astype(np.float32), variance, passes * per_pass)
-
-
-class MeshHits(NamedTuple):
-    """t: (N,) float32 in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32."""
-
-    t: np.ndarray
-    prim_id: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-
-
-def trace_mitsuba(mesh: Mesh, origins: np.ndarray, directions: np.ndarray, t_max: float = math.inf) -> MeshHits:
-    """Return the closest hits of rays (N, 3) with a mesh, in its object space, by Embree inside Mitsuba: about 5 microseconds a ray.
-
-    The hit point is (1 - u - v) * v0 + u * v1 + v * v2. Rays are rounded to float32.
-    """
-    origins, directions = np.asarray(origins, dtype=np.float32), np.asarray(directions, dtype=np.float32)
-    count = len(origins)
-    hits = MeshHits(np.full(count, np.inf, np.float32), np.full(count, -1, np.int32), np.zeros(count, np.float32),
-                    np.zeros(count, np.float32))
-    if len(mesh.faces) == 0:
-        return hits
-    with mitsuba() as mi:
-        triangles = make_mesh(mi, "mesh", Triangles(mesh.vertices, mesh.faces, None, None), {})
-        scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, "mesh": triangles})
-        longest = min(t_max, float(np.finfo(np.float32).max))
-        for index, (origin, direction) in enumerate(zip(origins.tolist(), directions.tolist(), strict=True)):
-            hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction, longest, 0.0, []))
-            if hit.is_valid():
-                hits.t[index], hits.prim_id[index] = hit.t, hit.prim_index
-                hits.u[index], hits.v[index] = hit.prim_uv
-    return hits
 
 
 class Aovs(NamedTuple):

@@ -6,8 +6,7 @@ import importlib
 from collections.abc import Mapping
 from types import ModuleType
 
-from wrt.lab.mitsuba.bsdfs import MitsubaObject
-from wrt.lab.mitsuba.shapes import Part
+from wrt.lab.mitsuba.shapes import MitsubaObject, Part
 from wrt.scene.model import Scene
 from wrt.scene.values import Color
 

@@ -329,7 +329,7 @@ class MitsubaRays(Contestant):
     NAME = package = "mitsuba"
 
     def missing(self) -> str:
-        from wrt.lab.mitsuba.process import llvm_missing
+        from wrt.lab.mitsuba.translate import llvm_missing
 
         return super().missing() or llvm_missing()
 

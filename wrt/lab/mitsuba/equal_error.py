@@ -2,16 +2,24 @@
 
 All pictures are compared with one reference. wrt takes a fixed number of samples. Mitsuba takes about as many as it needs for
 the same error. Its samples are independent, so its mean squared error falls as 1 / time. Mitsuba's time for exactly wrt's error follows.
-Runs alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process."""
+Runs alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process, so that a crash
+(LLVM 15 and 16 crash at the first picture) is a message."""
 
+import importlib
+import importlib.util
 import math
+import multiprocessing
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
+from types import TracebackType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,10 +30,10 @@ from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
 from wrt.lab.bench.timing import quartiles, shown, spread
 from wrt.lab.mitsuba import Mitsuba as Plan
-from wrt.lab.mitsuba.process import Job, MitsubaProcess
+from wrt.lab.mitsuba.translate import llvm_missing, mitsuba, translate
 from wrt.renderer.options import Options
 from wrt.renderer.render import Renderer
-from wrt.scene.cameras import Camera
+from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 
@@ -55,45 +63,98 @@ def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prep
                bias_below=below, prepare_seconds=prepare, process_seconds=start + float(np.median(seconds)))
 
 
-class _Measured:
-    """A variant of Mitsuba and its measurements."""
+class Job(NamedTuple):
+    """Task of a process: variant, scene, camera (or its name or index in the scene), integrator, and number of threads."""
 
-    def __init__(self, job: Job, process: MitsubaProcess) -> None:
-        self.job, self.process = job, process
+    variant: str
+    scene: Scene
+    camera: CameraKind | str | int | None
+    integrator: str
+    threads: int
+
+
+class Rival:
+    """A variant of Mitsuba in a process, which loads the scene and renders pictures until it is closed. load_seconds: time to load.
+
+    Raise InputError if the variant is not usable, Mitsuba cannot render the scene exactly, or the process has ended."""
+
+    def __init__(self, job: Job) -> None:
+        if importlib.util.find_spec("mitsuba") is None:
+            raise InputError("Mitsuba 3 is not usable (not installed)", hint='pip install "wrt[peers]" installs it')
+        if job.variant.startswith("llvm") and (reason := llvm_missing()):
+            raise InputError(reason)
+        self.job, self.spp, self.start = job, PILOT_SPP, math.nan
         self.runs: list[tuple[float, np.ndarray]] = []
-        self.spp, self.start = PILOT_SPP, math.nan
+        self.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+        self.load_seconds: float = self.ask(load, job)
+
+    def __enter__(self) -> "Rival":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.pool.shutdown(wait=kind is None, cancel_futures=True)
+
+    def ask(self, function: Callable[..., Any], *arguments: object) -> Any:
+        try:
+            return self.pool.submit(function, *arguments).result()
+        except BrokenProcessPool as error:
+            raise InputError(f"the process of Mitsuba {self.job.variant} ended without an answer") from error
+
+    def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
+        """Render a picture; return its seconds and pixels (H, W, 3) float32."""
+        found: tuple[float, np.ndarray] = self.ask(render, spp, seed % 2**31)
+        return found
 
     def choose_spp(self, seed: int, truth: Row, target: float, longest: float) -> None:
         """Set spp so that the mean squared error is about `target`, but that a picture takes at most about `longest` seconds.
         Mitsuba compiles kernels at the first picture with each spp, so that picture is not timed."""
-        self.process.render(PILOT_SPP, seed)
-        seconds, film = self.process.render(PILOT_SPP, seed)
+        self.render(PILOT_SPP, seed)
+        seconds, film = self.render(PILOT_SPP, seed)
         needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
         self.spp = int(np.clip(round(needed), 1, max(1.0, PILOT_SPP * longest / seconds)))
-        self.process.render(self.spp, seed)
-
-    def picture(self, seed: int) -> None:
-        self.runs.append(self.process.render(self.spp, seed))
+        self.render(self.spp, seed)
 
     def time_starts(self, times: int) -> None:
         """Set `start` to the median seconds of a process that imports, loads the scene from arrays and renders at 1 spp, as for wrt."""
-        program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
-        imports = process_seconds(["-c", program], times)
-        rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
+        imports = process_seconds(["-c", f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"], times)
+        rest = []
+        for _ in range(times + 1 if times else 0):
+            with Rival(self.job) as process:
+                rest.append(process.load_seconds + process.render(1, 0)[0])
         self.start = imports + float(np.median(rest[1:])) if times else imports
-
-    def _load_and_first_picture(self) -> float:
-        with MitsubaProcess(self.job) as process:
-            return process.load_seconds + process.render(1, 0)[0]
 
     def result(self, ours: Row, truth: Row) -> Row:
         """Return the figures of `side_of`. ratio, process_ratio: Mitsuba's time at wrt's error over wrt's time, to trace and in all.
         same_light: False if Mitsuba's squared bias is above SAME times wrt's squared error. Then the pictures show different light."""
-        side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
+        side = side_of(self.spp, self.runs, truth, self.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
         side.process_seconds = self.start + factor * float(np.median(side.seconds))
         return Row(**vars(side), ratio=quartiles(factor * np.array(side.seconds) / np.array(ours.seconds)),
                    process_ratio=side.process_seconds / ours.process_seconds, same_light=not side.bias**2 > SAME * ours.rmse**2)
+
+
+loaded: dict[str, Any] = {}  # of this process: Mitsuba's context, module and scene
+
+
+def load(job: Job) -> float:
+    """Load a scene in this process; return the seconds. Raise InputError if Mitsuba cannot."""
+    os.dup2(2, 1)  # output to stderr, since the parent's standard output may be JSON
+    try:
+        loaded["context"] = mitsuba(job.variant)
+        loaded["mi"] = loaded["context"].__enter__()
+        importlib.import_module("drjit").set_thread_count(job.threads)
+        begin = time.perf_counter()
+        loaded["scene"] = translate(loaded["mi"], job.scene, job.camera, job.integrator).scene
+        return time.perf_counter() - begin
+    except (ImportError, RuntimeError) as error:  # for example a library that cannot be loaded
+        raise InputError(str(error)) from None
+
+
+def render(spp: int, seed: int) -> tuple[float, np.ndarray]:
+    """Render the loaded scene; return the seconds and pixels (H, W, 3) float32."""
+    begin = time.perf_counter()
+    pixels = np.array(loaded["mi"].render(loaded["scene"], spp=spp, seed=seed), dtype=np.float32)
+    return time.perf_counter() - begin, pixels
 
 
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
@@ -104,28 +165,17 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
     threads, ours = thread_count(options.threads), []
-    rivals: dict[str, _Measured] = {}
+    rivals: dict[str, Rival] = {}
     not_available: dict[str, str] = {}
-
-    def each(do: Callable[[str], None], variants: Iterable[str]) -> None:
-        """Call do(variant) for variants of Mitsuba. Leave out those that fail; raise InputError if none is left."""
-        for variant in list(variants):
+    with ExitStack() as stack:
+        report("starting Mitsuba")
+        for variant in dict.fromkeys(plan.variants):
             try:
-                do(variant)
+                rivals[variant] = stack.enter_context(Rival(Job(variant, scene, options.camera, plan.integrator, threads)))
             except InputError as error:
-                rivals.pop(variant, None)
                 not_available[variant] = str(error)
         if not rivals:
             raise InputError("; ".join(f"Mitsuba {variant}: {why}" for variant, why in not_available.items()))
-
-    with ExitStack() as stack:
-
-        def begin(variant: str) -> None:
-            job = Job(variant, scene, options.camera, plan.integrator, threads)
-            rivals[variant] = _Measured(job, stack.enter_context(MitsubaProcess(job)))
-
-        report("starting Mitsuba")
-        each(begin, dict.fromkeys(plan.variants))
         report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS], scene.settings.max_depth)
         renderer = Renderer(scene, options)
@@ -138,16 +188,19 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
         require_error(target)
-        each(lambda name: rivals[name].choose_spp(pictures[0], truth, target, plan.rival_limit), rivals)
+        for rival in rivals.values():
+            rival.choose_spp(pictures[0], truth, target, plan.rival_limit)
         for turn, seed in enumerate(pictures):
             report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
                 ours.append(our_picture(seed))
-            each(partial(lambda seed, name: rivals[name].picture(seed), seed), rivals)
+            for rival in rivals.values():
+                rival.runs.append(rival.render(rival.spp, seed))
             if turn % 2 == 1:
                 ours.append(our_picture(seed))
         report("whole processes")
-        each(lambda name: rivals[name].time_starts(starts), rivals)
+        for rival in rivals.values():
+            rival.time_starts(starts)
     ready = renderer.prepared.seconds
     prepare = max(ready["compile"], ready["upload"] + ready["build"])  # these run in parallel
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))

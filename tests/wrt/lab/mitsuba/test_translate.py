@@ -20,7 +20,7 @@ from wrt.scene.settings import Settings
 
 pytest.importorskip("mitsuba", reason='needs Mitsuba 3 (pip install "wrt[peers]")')
 
-from tests.mitsuba_oracle import aov_mitsuba, render_mitsuba, to_mitsuba, trace_mitsuba
+from tests.mitsuba_oracle import aov_mitsuba, render_mitsuba, to_mitsuba
 from wrt.lab.mitsuba.translate import mitsuba
 
 CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
@@ -92,36 +92,7 @@ def test_the_callers_variant_is_given_back():
     assert mi.variant() == "scalar_spectral"
 
 
-def test_an_unknown_integrator_is_refused():
-    with refused("integrator", "must be one"):
-        render_mitsuba(Scene(cameras=(FRONT,)), spp=1, integrator="bdpt")
-
-
 # --- camera and film --------------------------------------------------------------------------------------------------
-
-
-def test_pixels_lie_where_the_camera_says():
-    spots = [((-0.7, 0.5), 0.12, (1, 0, 0)), ((0.55, 0.45), 0.2, (0, 2, 0)), ((0.3, -0.5), 0.15, (0, 0, 3))]
-    objects = tuple(Object(QUAD, (glowing(c),), transform=placed(x, y, 0, s)) for (x, y), s, c in spots)
-    scene = Scene(objects=objects, cameras=(OBLIQUE,))
-    size = (96, 54)
-    pixels = render_mitsuba(scene, size=size, spp=16, integrator="whitted").pixels
-    fine = plane_hit(OBLIQUE, (size[0] * 8, size[1] * 8))
-    expected = np.zeros((*fine.shape[:2], 3))
-    for (x, y), s, color in spots:
-        expected[(abs(fine[..., 0] - x) < s) & (abs(fine[..., 1] - y) < s)] = color
-    blocks = expected.reshape(size[1], 8, size[0], 8, 3)
-    certain = (blocks.min(axis=(1, 3)) == blocks.max(axis=(1, 3))).all(axis=-1)
-    # Cells of 1/8 pixel can miss a sliver of an edge: pixels that hold an edge, or touch one that does, are compared
-    # loosely.
-    border = ~certain
-    border[1:] |= ~certain[:-1]
-    border[:-1] |= ~certain[1:]
-    border[:, 1:] |= ~certain[:, :-1]
-    border[:, :-1] |= ~certain[:, 1:]
-    assert (~border).sum() > 0.6 * border.size and (expected[..., 2] > 0).any()
-    np.testing.assert_array_equal(pixels[~border], blocks.mean(axis=(1, 3))[~border].astype(np.float32))
-    assert abs(pixels - blocks.mean(axis=(1, 3))).mean() < 0.03
 
 
 def test_an_orthographic_camera_shows_a_ball_where_it_is_and_as_large_as_it_is():
@@ -148,72 +119,7 @@ def test_a_camera_that_mitsuba_has_not_is_refused_but_its_rays_can_be_traced():
     assert depth[16, 16] == pytest.approx(4.0) and np.isinf(depth[0, 0])
 
 
-def test_the_variance_is_that_of_the_mean():
-    scene = Scene(objects=(Object(QUAD, (Material(),)),), cameras=(FRONT,), background=WHITE_SKY,
-                  spheres=(Sphere((0, 0, 1.2), 0.3, BLACK_MATERIAL),))
-    runs = [render_mitsuba(scene, size=(8, 8), spp=32, integrator="direct", seed=seed) for seed in range(1, 25)]
-    observed = np.var([run.pixels for run in runs], axis=0, ddof=1).mean()
-    predicted = np.mean([run.variance for run in runs])
-    assert 0.75 < observed / predicted < 1.33
-    again = render_mitsuba(scene, size=(8, 8), spp=32, integrator="direct", seed=1)
-    np.testing.assert_array_equal(again.pixels, runs[0].pixels)
-
-
 # --- rays and AOVs ----------------------------------------------------------------------------------------------------
-
-
-def nearest(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """t of every ray with every triangle, (N, F) float64, inf on a miss (Moeller and Trumbore 1997)."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    p = np.cross(directions[:, None], (c - a)[None])
-    determinant = np.einsum("nfk,fk->nf", p, b - a)
-    s = origins[:, None] - a[None]
-    q = np.cross(s, (b - a)[None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.einsum("nfk,nfk->nf", s, p) / determinant
-        v = np.einsum("nfk,nk->nf", q, directions) / determinant
-        t = np.einsum("nfk,fk->nf", q, c - a) / determinant
-    return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
-
-
-def test_closest_hits_of_a_mesh():
-    rng = np.random.default_rng(7)
-    soup = Mesh(rng.uniform(-1, 1, (300, 3)), np.arange(300).reshape(100, 3))
-    origins = (3 * rng.normal(size=(500, 3))).astype(np.float32)
-    directions = (rng.uniform(-1, 1, (500, 3)) - origins).astype(np.float32)
-    hits = trace_mitsuba(soup, origins, directions)
-    expected = nearest(soup, origins.astype(np.float64), directions.astype(np.float64))
-    best = expected.min(axis=1)
-    assert 100 < np.isfinite(best).sum() < 500
-    np.testing.assert_array_equal(np.isfinite(hits.t), np.isfinite(best))
-    hit = np.isfinite(best)
-    np.testing.assert_allclose(hits.t[hit], best[hit], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(expected[hit, hits.prim_id[hit]], best[hit], rtol=1e-6)
-    assert (hits.prim_id[~hit] == -1).all()
-    corner = soup.vertices[soup.faces[hits.prim_id[hit]]].astype(np.float64)
-    u, v = hits.u[hit, None], hits.v[hit, None]
-    point = (1 - u - v) * corner[:, 0] + u * corner[:, 1] + v * corner[:, 2]
-    np.testing.assert_allclose(point, (origins + best[:, None] * directions)[hit], atol=2e-5)
-
-    limit = float(np.sort(best)[200:202].mean())
-    np.testing.assert_array_equal(np.isfinite(trace_mitsuba(soup, origins, directions, t_max=limit).t), best < limit)
-
-
-def test_no_ray_slips_through_a_shared_edge():
-    """From the middle of a closed mesh through edges and corners: without Embree's robust mode some rays get out."""
-    rng = np.random.default_rng(3)
-    corners = np.concatenate([np.eye(3), -np.eye(3)]) @ rotation(0, 0.5)[:3, :3] @ rotation(1, 0.9)[:3, :3]
-    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
-    octahedron = Mesh(corners, faces)
-    edges = octahedron.vertices[np.concatenate([faces[:, :2], faces[:, 1:]])].astype(np.float64)
-    share = np.concatenate([[0.0, 1.0], rng.uniform(0, 1, 400)])[:, None, None]
-    directions = ((1 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
-    assert (trace_mitsuba(octahedron, np.zeros_like(directions), directions).prim_id >= 0).all()
-
-
-def test_nothing_is_hit_where_there_is_nothing():
-    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    assert np.isinf(trace_mitsuba(nothing, np.zeros((2, 3)), np.ones((2, 3))).t).all()
 
 
 def test_sphere_aovs_are_the_analytic_ones():
@@ -282,15 +188,6 @@ def test_a_zero_normal_is_flat_there():
 
 
 # --- materials --------------------------------------------------------------------------------------------------------
-
-
-def test_furnace_of_diffuse_surfaces():
-    scene = Scene(spheres=(Sphere((0, 0, 0), 0.8, Material(albedo=(1, 0.5, 0.25))),), cameras=(FRONT,),
-                  background=WHITE_SKY)
-    mean, error = center_pixel(scene, integrator="whitted")
-    np.testing.assert_allclose(mean, (1, 0.5, 0.25), atol=5 * error.max())
-    mean, error = center_pixel(replace(scene, background=ConstantBackground(), ambient=(1, 1, 2)), integrator="whitted")
-    np.testing.assert_allclose(mean, (1, 0.5, 0.5), rtol=1e-5)
 
 
 @pytest.mark.parametrize("integrator", ["path", "whitted"])
