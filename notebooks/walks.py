@@ -16,7 +16,7 @@ import numpy as np
 import wrt
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.walk.drawing import Section
+from wrt.lab.walk.walk import Section
 from wrt.renderer.inspector.section import Plane, cut
 from wrt.scene.shapes import merged, quad, teapot
 

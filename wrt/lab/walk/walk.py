@@ -1,12 +1,13 @@
 """One ray through a structure, step by step: `wrt.walk`. The steps come from the recorder that counts, as those of `wrt.trace`.
 
-A step has values, words, the stack and the closest hit after it, and the region of space that it is about."""
+Drawings are in a plane through the ray: each box, cell and triangle appears as its section, so distances along the ray are exact. The
+x axis is the ray itself. The y axis is at right angles to it, and as close as possible to the coordinate axis that the ray follows least."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -16,175 +17,19 @@ from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.observed import RecordedSteps, record_steps
-from wrt.core.checks import shown
+from wrt.core.checks import as_integer, as_path, shown
 from wrt.core.errors import InputError
-from wrt.core.files import write_bytes
+from wrt.core.files import check_writable, replacing, write_bytes
+from wrt.core.packages import needed_by
 from wrt.core.types import ArrayLike, JsonObject, PathLike
-from wrt.kernels.traverse import steps as of
-from wrt.lab.walk.drawing import draw, write_picture
+from wrt.lab.walk.steps import Region, WalkStep, plain, regions_of, steps_of
+from wrt.renderer.inspector.section import Plane, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
-AXES = np.concatenate([np.eye(3), -np.eye(3)])
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """The points p with normals @ p + offsets <= 0 ((K, 3) and (K,) float64), or, if the radius is above 0, a sphere."""
-
-    normals: np.ndarray
-    offsets: np.ndarray
-    center: np.ndarray
-    radius: float = 0.0
-
-    @classmethod
-    def box(cls, lo: np.ndarray, hi: np.ndarray, radius: float = 0.0) -> Region:
-        lo, hi = lo.astype(np.float64), hi.astype(np.float64)
-        with np.errstate(invalid="ignore"):
-            return cls(AXES, np.concatenate([-hi, lo]), 0.5 * (lo + hi), radius)
-
-    def cut(self, normal: np.ndarray, offset: float) -> Region:
-        """Return the part on the side of a plane where dot(normal, p) + offset <= 0."""
-        return Region(np.append(self.normals, [normal.astype(np.float64)], axis=0), np.append(self.offsets, offset), self.center)
-
-    def interval(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, float]:
-        """Return t where the line enters and leaves; the first is greater if it misses."""
-        o, d = origin.astype(np.float64), direction.astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            if self.radius > 0.0:
-                a, b = d @ d, d @ (self.center - o)
-                root = b * b - a * (np.sum((self.center - o) ** 2) - self.radius**2)
-                return (float((b - np.sqrt(root)) / a), float((b + np.sqrt(root)) / a)) if root >= 0.0 else (np.inf, -np.inf)
-            height, slope = self.normals @ o + self.offsets, self.normals @ d
-            t = -height / slope
-        if (height[slope == 0.0] > 0.0).any() or self.radius < 0.0:
-            return np.inf, -np.inf
-        return float(t[slope < 0.0].max(initial=-np.inf)), float(t[slope > 0.0].min(initial=np.inf))
-
-
-def regions_of(steps: np.ndarray) -> list[Region | None]:
-    """Return the region of each step, None for pushes, pops, tests and what has no recorded bounds. steps: of one ray."""
-    known: dict[tuple[int, int], Region] = {}
-    node: tuple[int, int] | None = None
-    out: list[Region | None] = []
-    for step in steps:
-        kind, key = step["kind"], (int(step["index"]), int(step["count"]))
-        if kind == of.NODE:
-            node = (key[0], int(of.INNER))
-            key = node
-        elif kind == of.BOX:
-            known[key] = Region.box(step["lo"], step["hi"], float(step["edges"][0]))
-        elif kind == of.CELL:
-            known[key] = Region.box(step["lo"], step["hi"])
-        elif kind == of.PART and node in known:
-            known[key] = known[node].cut(step["lo"], float(step["hi"][0]))
-        elif kind == of.PLANE and node is not None:
-            key = node
-        out.append(known.get(key) if kind in (of.NODE, of.BOX, of.CELL, of.PART, of.PLANE, of.LEAF) else None)
-    return out
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A child of a node, on the stack or not. index: an inner node, or the first of `count` primitives. t: where the ray enters it."""
-
-    index: int
-    count: int  # of a leaf; -1: inner node
-    t: float
-
-    def __str__(self) -> str:
-        return name_of(self.index, self.count)
-
-
-@dataclass(frozen=True)
-class WalkStep:
-    """A step of a walk."""
-
-    kind: str  # One of kernels.traverse.steps.KINDS.
-    text: str  # The step in words.
-    index: int  # Node, primitive or child.
-    count: int  # -1 for a node, else the number of primitives of a leaf.
-    depth: int  # Number of links from the root to the present node or leaf.
-    result: str  # Of a test: an entry of kernels.traverse.steps.RESULTS. Else "entered", "missed", "taken", "dropped", or "".
-    # Box, part, cell: where the ray enters and leaves, also if it misses; plane: where the line crosses it; push, pop: where the ray
-    # enters the entry; test: of the hit on the whole line, inf on a miss.
-    t: float
-    t_end: float
-    prim_id: int  # Of a test, else -1.
-    u: float  # u, v: of a test's hit.
-    v: float
-    # Of a test: the three edge values; a line through the triangle has no two of opposite signs. NaN if the test has no edge values.
-    edges: tuple[float, float, float]
-    stack: tuple[Entry, ...]  # After the step, the top last.
-    best_t: float  # best_t, best_prim: the closest hit after the step; t_max and -1 before the first hit.
-    best_prim: int
-
-    def as_dict(self) -> JsonObject:
-        """Return the step for JSON; a number that is not finite becomes text."""
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
-        return plain(own | {"stack": [vars(entry) for entry in self.stack]})
-
-
-def name_of(index: int, count: int) -> str:
-    if count < 0:
-        return f"node {index}"
-    if count == 0:
-        return "an empty leaf"
-    return f"leaf {index}" if count <= 1 else f"leaf {index} to {index + count - 1}"
-
-
-def in_words(step: WalkStep, bits: int) -> str:
-    """Return the step in words. bits: the recorded result."""
-    name, t = name_of(step.index, step.count), f"{step.t:.6g}"
-    stack = ", ".join(map(str, step.stack)) or "empty"
-    match step.kind:
-        case "node":
-            return name
-        case "cell":
-            return f"cell {step.index if step.index >= 0 else '(whole structure)'}: t from {t} to {step.t_end:.6g}"
-        case "plane":
-            return f"plane of node {step.index}: the line crosses it at t = {t}"
-        case "box" | "part":
-            what = "box" if step.kind == "box" else "side"
-            return f"{what} of {name}: {entry_in_words(step)}"
-        case "leaf":
-            return f"{name}: {step.count} primitive{'' if step.count == 1 else 's'}"
-        case "skip":
-            return f"primitive {step.index}: tested before (mailbox)"
-        case "push":
-            return f"push {name} (t = {t}); stack: {stack}"
-        case "pop":
-            left = " (further octants stay)" if bits & of.STAYS else ""
-            why = "" if step.result == "taken" else f", because t = {t} is behind the closest hit"
-            return f"pop {name}: {step.result}{why}{left}; stack: {stack}"
-    edges = "" if math.isnan(step.edges[0]) else f", edges {', '.join(f'{edge:.3g}' for edge in step.edges)}"
-    hit = f", t = {t}, u = {step.u:.4g}, v = {step.v:.4g}" if math.isfinite(step.t) else ""
-    return f"triangle {step.prim_id} (primitive {step.index}){edges}{hit}: {step.result}"
-
-
-def entry_in_words(step: WalkStep) -> str:
-    """Return where the line enters and leaves a region, and why the ray does not enter it. Distances are rounded; the kernel decides."""
-    if step.result == "entered":
-        return f"entered at t = {step.t:.6g}, left at {step.t_end:.6g}"
-    if step.count == 0:
-        return "not visited"
-    if not step.t <= step.t_end:
-        return "missed, the line is outside"
-    if step.t > step.best_t:
-        behind = "the closest hit" if step.best_prim >= 0 else "t_max"
-        return f"missed, entered at t = {step.t:.6g}, behind {behind} at {step.best_t:.6g}"
-    return f"missed (t from {step.t:.6g} to {step.t_end:.6g})"
-
-
-def plain(value: Any) -> Any:
-    """Convert a value for JSON, which has no infinity and no NaN."""
-    if isinstance(value, dict):
-        return {name: plain(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+COLORS = {"entered": "tab:green", "missed": "tab:red", "taken": "tab:green", "dropped": "tab:red", "visited": "0.75", "stack": "tab:blue"}
+MOST_FACES = 100_000  # the sections of larger meshes are not drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +54,7 @@ class Walk:
 
     @cached_property
     def steps(self) -> tuple[WalkStep, ...]:
-        return tuple(steps_of(self))
+        return tuple(steps_of(self.recorded, self.regions, self.t_max))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -234,7 +79,7 @@ class Walk:
                       "t_min": self.t_min, "t_max": self.t_max, "counts": self.counts, "steps": [step.as_dict() for step in self.steps]})
 
     def draw(self, axes: Axes | None = None, step: int | None = None) -> Axes:
-        """Draw the walk up to a step, in the plane through the ray, as wrt.lab.walk.drawing.draw describes.
+        """Draw the walk up to a step, in the plane through the ray, as wrt.lab.walk.walk.draw describes.
 
         Parameters
         ----------
@@ -272,37 +117,6 @@ class Walk:
             write_picture(self, path, fps)
 
 
-def steps_of(walk: Walk) -> list[WalkStep]:
-    """Convert the recorded steps, and keep the stack and the closest hit."""
-    stack: list[Entry] = []
-    best_t, best_prim = walk.t_max, -1
-    out = []
-    depths = walk.recorded.depths()
-    for i, step in enumerate(walk.recorded.steps):
-        kind, index, count = of.KINDS[step["kind"]], int(step["index"]), int(step["count"])
-        bits, t, t_end = int(step["result"]), float(step["t"]), float(step["t_end"])
-        region, result = walk.regions[i], ""
-        if region is not None and kind in ("box", "part"):
-            result = "entered" if bits & of.ENTERED else "missed"
-            t, t_end = region.interval(walk.origin, walk.direction)
-        elif kind == "test":
-            result = of.RESULTS[bits]
-            if bits == of.CLOSEST:
-                best_t, best_prim = t, int(step["prim_id"])
-        elif kind == "push":
-            stack.insert(int(step["prim_id"]), Entry(index, count, t))
-        elif kind == "pop":
-            result = "taken" if bits & of.ENTERED else "dropped"
-            if not bits & of.STAYS:
-                stack.pop()
-        is_test, (edge_0, edge_1, edge_2) = kind == "test", map(float, step["edges"])
-        made = WalkStep(kind, "", index, -1 if kind in ("node", "plane", "cell") else count, int(depths[i]), result, t, t_end,
-                        int(step["prim_id"]) if is_test else -1, float(step["u"]), float(step["v"]), (edge_0, edge_1, edge_2),
-                        tuple(stack), best_t, best_prim)
-        out.append(WalkStep(**{**vars(made), "text": in_words(made, bits)}))
-    return out
-
-
 def listed(values: np.ndarray) -> str:
     return f"({', '.join(f'{value:g}' for value in values)})"
 
@@ -335,3 +149,154 @@ def walk(accel: Accelerator, origin: ArrayLike, direction: ArrayLike, t_min: flo
     recorded = record_steps(accel, np.asarray(origin)[None], np.asarray(direction)[None], t_min, t_max)
     assert isinstance(accel, OneMesh)
     return Walk(recorded.structure, recorded.origin[0], recorded.direction[0], float(t_min), float(t_max), recorded, accel.geometry)
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A plane through a ray's origin, and along the ray in the plane's direction `across`. window: (x0, x1, y0, y1)."""
+
+    plane: Plane
+    length: float  # of the direction: x = t * length
+    window: tuple[float, float, float, float]
+
+    def outline(self, region: Region) -> np.ndarray:
+        """Return the corners of a region's section within the window, (K, 2); (0, 2) if the plane misses it."""
+        if region.radius != 0.0:
+            squared = region.radius**2 - self.plane.distance(region.center) ** 2
+            angle = np.linspace(0.0, 2.0 * np.pi, 73)
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            return self.plane.project(region.center) + np.sqrt(squared) * circle if squared > 0.0 else empty()
+        x0, x1, y0, y1 = self.window
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        for normal, offset in zip(region.normals, region.offsets, strict=True):
+            flat = np.array([normal @ self.plane.across, normal @ self.plane.up])
+            corners = clipped(corners, flat, float(normal @ self.plane.origin + offset))
+        return corners
+
+
+def empty() -> np.ndarray:
+    return np.zeros((0, 2))
+
+
+def clipped(corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
+    """Clip a convex polygon (K, 2) to the half plane normal @ p + offset <= 0 (Sutherland and Hodgman 1974)."""
+    if not np.isfinite(offset):
+        return corners if offset < 0.0 else empty()
+    height = corners @ normal + offset
+    out = []
+    for i in range(len(corners)):
+        a, b = height[i - 1], height[i]
+        if (a > 0.0) != (b > 0.0):
+            out.append(corners[i - 1] + a / (a - b) * (corners[i] - corners[i - 1]))
+        if b <= 0.0:
+            out.append(corners[i])
+    return np.array(out) if out else empty()
+
+
+def section_of(walk: Walk) -> Section:
+    """Choose the plane, and a window around the mesh's box and the ray's origin or, if that is far, the ray's part near the box."""
+    direction = walk.direction.astype(np.float64)
+    length = float(np.linalg.norm(direction))
+    along = direction / length
+    axis = np.eye(3)[int(np.argmin(np.abs(along)))]
+    across = axis - (axis @ along) * along
+    plane = Plane(walk.origin.astype(np.float64), along, across / np.linalg.norm(across))
+    low, high = walk.geometry.bounds()  # of each triangle and sphere
+    lo, hi = low.min(axis=0).astype(np.float64), high.max(axis=0).astype(np.float64)
+    corners = np.array([[(lo, hi)[k >> a & 1][a] for a in range(3)] for k in range(8)])
+    flat = plane.project(corners)
+    x0, x1, y0, y1 = flat[:, 0].min(), flat[:, 0].max(), min(flat[:, 1].min(), 0.0), max(flat[:, 1].max(), 0.0)
+    size = max(x1 - x0, y1 - y0)
+    x0 = min(x0, max(0.0, x0 - 0.3 * size))
+    return Section(plane, length, (x0 - 0.05 * size, x1 + 0.05 * size, y0 - 0.05 * size, y1 + 0.05 * size))
+
+
+def draw(walk: Walk, axes: Axes | None, step: int | None) -> Axes:
+    """Draw the walk up to a step. Green: entered; red: missed; grey: visited nodes; blue: entries of the stack; black: tested triangles."""
+    if axes is None:
+        with needed_by("a drawing"):
+            import matplotlib.pyplot as plt
+        axes = plt.subplots(figsize=(7.0, 5.0), layout="constrained")[1]
+    last = len(walk) - 1 if step is None else as_integer(step, "step", -len(walk), len(walk) - 1) % max(len(walk), 1)
+    section = section_of(walk)
+    x0, x1, y0, y1 = section.window
+    corners = walk.geometry.vertices.astype(np.float64)[walk.geometry.faces]
+    if len(corners) <= MOST_FACES:
+        axes.plot(*segments_of(cut(corners, section.plane)), color="0.8", lw=0.8, zorder=1)
+    steps = walk.steps[: last + 1]
+    draw_regions(walk, axes, section, last)
+    tested = np.array([each.prim_id for each in steps if 0 <= each.prim_id < len(corners)], int)
+    axes.plot(*segments_of(cut(corners[tested], section.plane)), color="black", lw=1.4, zorder=4)
+    now = steps[-1] if steps else None
+    end = min(now.best_t if now else walk.t_max, 1e30) * section.length
+    axes.annotate("", (min(end, x1), 0.0), (max(walk.t_min * section.length, x0), 0.0), zorder=6,
+                  arrowprops={"arrowstyle": "->", "color": "tab:orange", "lw": 1.6})
+    if now is not None:
+        if 0 <= now.prim_id < len(corners):
+            color = COLORS["entered" if now.result == "closest hit" else "missed"]
+            axes.plot(*segments_of(cut(corners[[now.prim_id]], section.plane)), color=color, lw=3.0, zorder=5)
+        if now.best_prim >= 0:
+            axes.plot([now.best_t * section.length], [0.0], "o", color="tab:orange", zorder=7)
+        axes.set_title(f"{walk.structure}, step {last} of {len(walk) - 1}: {now.text}", fontsize="small", loc="left", wrap=True)
+    unit = "t" if abs(section.length - 1.0) < 1e-6 else f"t times {section.length:.4g}"
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel=f"distance along the ray ({unit})", ylabel="distance from the ray")
+    return axes
+
+
+def draw_regions(walk: Walk, axes: Axes, section: Section, last: int) -> None:
+    """Draw the sections of all visited nodes, of the stack's entries, and of the step `last`."""
+    regions, steps = walk.regions, walk.steps
+    outlines: list[tuple[Region | None, dict[str, Any]]] = []
+    known: dict[tuple[int, int], Region] = {}
+    for i, each in enumerate(steps[: last + 1]):
+        region = regions[i]
+        if region is not None:
+            known[(each.index, each.count)] = region
+            if each.kind in ("node", "cell", "leaf"):
+                outlines.append((region, {"ec": COLORS["visited"], "lw": 1.0, "zorder": 2}))
+    if last >= 0:
+        now = steps[last]
+        outlines += [(known.get((entry.index, entry.count)), {"ec": COLORS["stack"], "lw": 1.2, "zorder": 3}) for entry in now.stack]
+        region = regions[last] or (known.get((now.index, now.count)) if now.kind in ("push", "pop") else None)
+        color = COLORS.get(now.result, COLORS["stack"] if now.kind == "push" else "black")
+        outlines.append((region, {"ec": color, "lw": 2.2, "zorder": 4, "ls": "--" if now.result in ("missed", "dropped") else "-"}))
+    from matplotlib.patches import Polygon
+
+    for region, style in outlines:
+        outline = empty() if region is None else section.outline(region)
+        if len(outline) > 1:
+            axes.add_patch(Polygon(outline, closed=True, fill=False, **style))
+
+
+def segments_of(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y of segments (N, 2, 2) for one call of `plot`, with NaN between them."""
+    padded = np.concatenate([ends, np.full((len(ends), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+    return padded[:, 0], padded[:, 1]
+
+
+def write_picture(walk: Walk, path: PathLike, fps: int) -> None:
+    """Write an animation (.gif) or a picture (.png), as Walk.save describes."""
+    target = as_path(path, "path")
+    suffix = target.suffix.lower()
+    if suffix not in (".gif", ".png"):
+        raise InputError("must have the suffix .gif, .png, .json or .txt", path=path)
+    if not len(walk):
+        raise InputError("there is no step to draw: the ray tests nothing", path=path)
+    as_integer(fps, "fps", 1, 60)
+    check_writable(target)
+    with needed_by("a drawing"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from PIL import Image
+    figure = Figure(figsize=(7.0, 5.0), dpi=100, layout="constrained")
+    canvas, frames = FigureCanvasAgg(figure), []
+    for step in range(len(walk)) if suffix == ".gif" else [len(walk) - 1]:
+        figure.clear()
+        draw(walk, figure.subplots(), step)
+        canvas.draw()
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    with replacing(target) as file:
+        if suffix == ".png":
+            frames[0].save(file, format="png")
+        else:
+            frames[0].save(file, format="gif", save_all=True, append_images=frames[1:], duration=1000 // fps, loop=0)

@@ -14,8 +14,8 @@ from tests.data import data_path
 from tests.structures import STRUCTURES, families_first
 from wrt.accel.queries.observed import RecordedSteps, record_steps
 from wrt.kernels.traverse import steps as of
-from wrt.lab.walk.drawing import section_of
-from wrt.lab.walk.walk import Entry, Region
+from wrt.lab.walk.steps import Entry, Region
+from wrt.lab.walk.walk import section_of
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene, Sphere
