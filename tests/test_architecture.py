@@ -96,9 +96,9 @@ LONG_FUNCTIONS = 9  # Functions with more than 60 lines.
 LONG_SIGNATURES = 5  # Functions with more than 7 parameters: public queries, all of which take `world`.
 # Lines of each folder of wrt and kernels, with headers. A commit may lower an entry, or raise one and lower others by as much.
 MOST_LINES = {
-    "kernels": 1582, "kernels/build": 3111, "kernels/loops": 1767, "kernels/shade": 4063, "kernels/study": 668,
-    "kernels/traverse": 2063, "kernels/units": 815, "kernels/wide": 3800, "wrt": 350, "wrt/accel": 8415,
-    "wrt/cli": 1441, "wrt/compat": 952, "wrt/core": 1837, "wrt/io": 3538, "wrt/lab": 8491, "wrt/picture": 1184,
+    "kernels": 1582, "kernels/build": 3110, "kernels/loops": 1767, "kernels/shade": 4063, "kernels/study": 668,
+    "kernels/traverse": 2018, "kernels/units": 815, "kernels/wide": 3799, "wrt": 350, "wrt/accel": 8406,
+    "wrt/cli": 1441, "wrt/compat": 952, "wrt/core": 1833, "wrt/io": 3538, "wrt/lab": 8189, "wrt/picture": 1184,
     "wrt/renderer": 3512, "wrt/scene": 2621, "wrt/sensors": 806, "wrt/viewer": 1363,
 }
 

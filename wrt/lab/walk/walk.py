@@ -1,7 +1,7 @@
 """One ray through a structure, step by step: `wrt.walk`. The steps come from the recorder that counts, as those of `wrt.trace`.
 
 Drawings are in a plane through the ray: each box, cell and triangle appears as its section, so distances along the ray are exact. The
-x axis is the ray itself. The y axis is at right angles to it, and as close as possible to the coordinate axis that the ray follows least."""
+x axis is the ray. The y axis is at right angles to it, and as close as possible to the coordinate axis that the ray follows least."""
 
 from __future__ import annotations
 
