@@ -138,7 +138,7 @@ def test_nothing_outside_of_the_folder_is_read(uri: str, tmp_path: Path, monkeyp
             continue
         with refused(path=file_path) as caught:
             load_gltf(file_path)
-        assert caught.value.place.endswith(f"{array}[0].uri")
+        assert f"{array}[0].uri: " in caught.value.place
 
 
 def test_warnings_do_not_grow_with_the_file(tmp_path: Path) -> None:

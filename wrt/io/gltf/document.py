@@ -8,7 +8,6 @@ import base64
 import json
 import re
 import struct
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
 from urllib.parse import unquote_to_bytes
@@ -17,7 +16,7 @@ import numpy as np
 
 from wrt.core.checks import listed, short
 from wrt.core.errors import InputError, at
-from wrt.core.files import read_file, utf8
+from wrt.core.files import read_file
 from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.gltf.schema import EXTENSIONS, FILE, ITEMS, read
@@ -39,18 +38,17 @@ METADATA_EXTENSIONS = frozenset({
 })
 DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
 _LOOKS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "EXT_lights_", "MSFT_texture_")  # shapes do not need them
-_CODECS = frozenset({"KHR_texture_basisu", "MSFT_texture_dds"})
 
 
 class LeftOut:
     """Features of a file that wrt leaves out of the picture or changes, each with the objects that have it."""
 
     def __init__(self) -> None:
-        self._places: dict[str, dict[str, dict[str, None]]] = {}
+        self._places: dict[str, dict[str, None]] = {}
 
     def add(self, feature: str, kind: str, name: str) -> None:
         """Record that the object `name` has `feature`. kind: the object's kind, such as "material" or "node"."""
-        self._places.setdefault(feature, {}).setdefault(kind, {})[name] = None
+        self._places.setdefault(feature, {})[f"{kind} {short(name)}"] = None
 
     def add_extensions(self, extensions: JsonObject | None, kind: str, name: str) -> None:
         """Record the extensions of an object that could change the picture and are not read by wrt."""
@@ -70,16 +68,9 @@ class LeftOut:
         return feature in self._places
 
     def sentence(self) -> str:
-        """Return all features with their objects in one line, or "" without features; long lists of names are cut."""
-        return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
-
-    @staticmethod
-    def _where(kinds: dict[str, dict[str, None]]) -> str:
-        parts = []
-        for kind, names in kinds.items():
-            plural = {"mesh": "meshes"}.get(kind, kind + "s") if len(names) > 1 else kind
-            parts.append(f"{plural} {listed(names)}")
-        return "; ".join(parts)
+        """Return all features in one line, each with its first five objects; "" without features."""
+        return ", ".join(f"{feature} ({', '.join([*places][:5])}{f' and {len(places) - 5} more' * (len(places) > 5)})"
+                         for feature, places in self._places.items())
 
 
 class Document:
@@ -93,10 +84,17 @@ class Document:
         raw, self._binary = _read_container(self.path)
         if not isinstance(raw, dict):
             raise InputError("is not a glTF file: its JSON is not an object")
-        _check_version(raw)
         self._raw, self._items = raw, dict[tuple[str, int], GltfObject]()
         self.gltf: GltfObject = read(FILE, raw, "")
-        _check_required_extensions(each for each in self.gltf.extensionsRequired if not (shapes_only and each.startswith(_LOOKS)))
+        for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # readers of 2.0 may read any 2.x
+            version = getattr(self.gltf.asset, key)
+            if version is not None and not re.fullmatch(readable, version):
+                raise InputError(f"is {short(version)}; wrt reads 2.0", place=f"asset.{key}")
+        unknown = set(self.gltf.extensionsRequired) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS - DEFAULT_LOOK
+        unknown = {each for each in unknown if not (shapes_only and each.startswith(_LOOKS))}
+        if unknown:
+            raise InputError(f"the file needs {listed(sorted(unknown))}, which wrt does not support", place="extensionsRequired",
+                             hint="save the file without it")
         self.left_out, self.mistakes = LeftOut(), LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
         self._decoded: dict[int, np.ndarray] = {}  # compressed buffer views
@@ -169,13 +167,14 @@ class Document:
     def resource(self, uri: str, place: str) -> bytes:
         """Return the bytes of a data: URI, or of a file whose relative path stays in the folder of the glTF file."""
         if uri[:5].lower() == "data:":
-            with at(place):
-                return _decode_data_uri(uri)
-        name = _local_name(uri, place)
-        try:
-            return read_file(self.path.parent / name)
-        except InputError as error:
-            raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", place=place) from None
+            head, _, body = uri.partition(",")
+            try:
+                data = unquote_to_bytes(body)
+                return base64.b64decode(data, validate=True) if head.lower().endswith(";base64") else data
+            except ValueError as error:  # binascii.Error, and a lone surrogate
+                raise InputError(f"is a data: URI that cannot be decoded: {error}", place=place) from None
+        with at(f"{place}: {short(uri)}"):
+            return read_file(self.path.parent / _local_name(uri))
 
 
 def _decode_meshopt(data: np.ndarray, view: GltfObject, length: int, place: str) -> np.ndarray:
@@ -195,96 +194,49 @@ def _decode_meshopt(data: np.ndarray, view: GltfObject, length: int, place: str)
     return decoded.reshape(-1).view(np.uint8)
 
 
-def _read_container(path: Path) -> tuple[object, bytes | memoryview | None]:
+def _read_container(path: Path) -> tuple[object, memoryview | None]:
     """Return the parsed JSON and the binary chunk of a .gltf or .glb file, whose first four bytes distinguish the formats."""
     data = read_file(path)
+    chunks: dict[int, memoryview] = {}
     if data[:4] == GLB_MAGIC:
-        return _read_glb(data)
-    if path.suffix.lower() == ".glb":
+        chunks = _chunks(data)
+    elif path.suffix.lower() == ".glb":
         raise InputError(f"is not a .glb file: it starts with {data[:4]!r}, not {GLB_MAGIC!r}")
-    return _parse_json(data), None
-
-
-def _read_glb(data: bytes) -> tuple[object, bytes | memoryview | None]:
-    if len(data) < 20:
-        raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", place="header")
-    version, length = struct.unpack_from("<II", data, 4)
-    if version != 2:
-        raise InputError(f"is glTF {version}; wrt reads 2.0", place="header.version")
-    if length > len(data):
-        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}", place="header.length")
-    chunks: list[tuple[int, memoryview]] = []
-    offset = 12
-    while offset + 8 <= length:
-        size, kind = struct.unpack_from("<II", data, offset)
-        if offset + 8 + size > length:
-            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}", place=f"chunk {len(chunks)}")
-        if len(chunks) < 2:  # further chunks have no meaning
-            chunks.append((kind, memoryview(data)[offset + 8:offset + 8 + size]))
-        offset += 8 + size
-    if not chunks or chunks[0][0] != _CHUNK_JSON:
-        raise InputError("must be JSON", place="chunk 0")
-    binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _CHUNK_BIN else None
-    return _parse_json(bytes(chunks[0][1])), binary
-
-
-def _parse_json(data: bytes) -> object:
     try:
-        return json.loads(utf8(data).decode())  # with NaN and Infinity, which `read` refuses where they are used
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
+        return json.loads(bytes(chunks.get(_CHUNK_JSON, data))), chunks.get(_CHUNK_BIN)  # NaN is refused where it is used
     except RecursionError:
         raise InputError("is not valid JSON: nested too deeply") from None
-    except InputError:
-        raise
-    except ValueError as error:  # JSONDecodeError; an integer of thousands of digits
+    except ValueError as error:  # no JSON, no UTF-8, or an integer of thousands of digits
         raise InputError(f"is not valid JSON: {error}") from None
 
 
-def _check_version(raw: JsonObject) -> None:
-    asset = raw.get("asset")
-    if not isinstance(asset, dict) or not isinstance(asset.get("version"), str):
-        raise InputError("must be a string such as '2.0'", place="asset.version")
-    for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # readers of 2.0 may read any 2.x
-        version = asset.get(key)
-        if version is not None and not re.fullmatch(readable, str(version)):
-            raise InputError(f"is {short(version)}; wrt reads 2.0", place=f"asset.{key}")
+def _chunks(data: bytes) -> dict[int, memoryview]:
+    """Return the chunks of a .glb file by their kind; the first of each kind counts."""
+    version, length = struct.unpack("<II", data[4:12].ljust(8, b"\0"))
+    if not 12 <= length <= len(data):
+        raise InputError(f"is truncated: it has {len(data)} bytes, but its header announces {length}", place="header")
+    if version != 2:
+        raise InputError(f"is glTF {version}; wrt reads 2.0", place="header")
+    chunks: dict[int, memoryview] = {}
+    end = 12
+    while end + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, end)
+        begin, end = end + 8, end + 8 + size
+        if end > length:
+            raise InputError(f"is truncated: it ends at byte {end}, the file at {length}", place=f"chunk {len(chunks)}")
+        chunks.setdefault(kind, memoryview(data)[begin:end])
+    if _CHUNK_JSON not in chunks:
+        raise InputError("has no JSON chunk")
+    return chunks
 
 
-def _check_required_extensions(required: Iterable[str]) -> None:
-    unknown = sorted(set(required) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS - DEFAULT_LOOK)
-    if unknown:
-        codecs = [name for name in unknown if name in _CODECS]
-        hint = f"there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else None
-        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support", place="extensionsRequired", hint=hint)
-
-
-def _decode_data_uri(uri: str) -> bytes:
-    head, comma, body = uri.partition(",")
-    if not comma:
-        raise InputError("is a data: URI without a comma")
-    try:
-        data = unquote_to_bytes(body)
-        return base64.b64decode(data, validate=True) if head.lower().endswith(";base64") else data
-    except ValueError as error:  # binascii.Error, and a lone surrogate
-        raise InputError(f"is a data: URI that cannot be decoded: {error}") from None
-
-
-def _local_name(uri: str, place: str) -> str:
+def _local_name(uri: str) -> str:
     """Return the relative path of a URI. Raises InputError for a path that leaves the folder, because the file is untrusted."""
     try:
-        name = unquote_to_bytes(uri).decode("utf-8").replace("\\", "/")
+        name = unquote_to_bytes(uri).decode().replace("\\", "/")
     except UnicodeError:
-        raise InputError(f"{uri[:80]!r} is not UTF-8", place=place) from None
-    problem = ""
-    if not name or any(ord(character) < 32 for character in name):
-        problem = "is empty or holds a control character"
-    elif re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name):
-        problem = "is an address; only files beside the glTF file are read"
-    elif name.startswith("/"):
-        problem = "is an absolute path; only files beside the glTF file are read"
-    elif ".." in name.split("/"):
-        problem = "leaves the folder of the glTF file; copy what it needs beside it"
-    if problem:
-        raise InputError(f"{uri[:80]!r} {problem}", place=place)
+        name = ""
+    is_address = re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name) is not None
+    if not name or is_address or name.startswith("/") or ".." in name.split("/") or any(ord(character) < 32 for character in name):
+        raise InputError("is no path of a file in the folder of the glTF file or below", hint="copy the file beside the glTF file")
     return name

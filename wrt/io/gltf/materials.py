@@ -17,8 +17,8 @@ from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.schema import ITEMS, read
 from wrt.picture.decode import decode_rgba8
 from wrt.scene.kinds import forms
-from wrt.scene.materials import Material, Texture
-from wrt.scene.values import BLACK, Color
+from wrt.scene.materials import SLOTS, Material, Texture
+from wrt.scene.values import BLACK
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
@@ -29,15 +29,17 @@ _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
 _LIMITS = {key: (each.metadata["limits"].get("ge", 0.0), each.metadata["limits"].get("le", LARGEST))
            for key, each in forms(Material).items() if each.metadata["form"] in ("number", "color")}
-
-# Values with which an unsupported extension has no effect: the warning then leaves it out.
-_NEUTRAL: dict[str, dict[str, Any]] = {
-    "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0]},
-    "KHR_materials_iridescence": {"iridescenceFactor": 0},
-    "KHR_materials_anisotropy": {"anisotropyStrength": 0},
-    "KHR_materials_dispersion": {"dispersion": 0},
-    "KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0},
+# The fields of a Material by the object of glTF that holds them, with their keys in it.
+_KEYS = {
+    "pbrMetallicRoughness": {"metallic": "metallicFactor", "roughness": "roughnessFactor",
+                             "metallic_roughness_texture": "metallicRoughnessTexture"},
+    "KHR_materials_specular": {"specular_factor": "specularFactor", "specular_color": "specularColorFactor",
+                               "specular_texture": "specularTexture", "specular_color_texture": "specularColorTexture"},
+    "KHR_materials_transmission": {"transmission": "transmissionFactor", "transmission_texture": "transmissionTexture"},
+    "KHR_materials_clearcoat": {"clearcoat": "clearcoatFactor", "clearcoat_roughness": "clearcoatRoughnessFactor",
+                                "clearcoat_texture": "clearcoatTexture", "clearcoat_roughness_texture": "clearcoatRoughnessTexture"},
 }
+_SWITCHES = ("transmission", "clearcoat")  # a factor of 0 means that the extension has no effect
 
 
 class Textures:
@@ -95,18 +97,10 @@ class Textures:
     def _wrap(self, texture: GltfObject, material: str, place: str) -> tuple[str, str]:
         if texture.sampler is None:
             return ("repeat", "repeat")
-        try:
-            sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
-            for axis in ("wrapS", "wrapT"):
-                if getattr(sampler, axis) not in _WRAPS:
-                    raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}",
-                                     place=f"samplers[{texture.sampler}].{axis}")
-        except InputError as error:
-            self._document.mistakes.add(f"a sampler, because {error}", "material", material)
-            return ("repeat", "repeat")
+        sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
         if sampler.magFilter == _NEAREST:
             self._document.left_out.add("nearest-neighbour sampling", "material", material)
-        return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
+        return (_WRAPS.get(sampler.wrapS, "repeat"), _WRAPS.get(sampler.wrapT, "repeat"))
 
     def _source(self, texture: GltfObject, place: str) -> int | None:
         """Return the index of the texture's PNG or JPEG image, else of the image in an extension, else None."""
@@ -125,7 +119,7 @@ class Textures:
             image = self._document.item("images", index, place)
             if image.uri is not None:
                 data: Any = self._document.resource(image.uri, f"{place}.uri")
-                place = f"{place}.uri" if image.uri[:5] == "data:" else f"{place}.uri ({image.uri})"
+                place = f"{place}.uri: {short(image.uri)}"
             elif image.bufferView is not None:
                 data = self._document.view(image.bufferView, f"{place}.bufferView")[0].tobytes()
             else:
@@ -166,20 +160,26 @@ class Materials:
         return self._materials[index]
 
     def _make(self, source: GltfObject, name: str, place: str) -> Material:
-        for extension, raw in source.extensions.items():
-            neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
-            if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
-                self._document.left_out.add_extensions({extension: raw}, "material", name)
-        glossy = self._document.extension(source, _GLOSSY, place)
-        if glossy is not None:
+        document = self._document
+        document.left_out.add_extensions(source.extensions, "material", name)
+        glossy = document.extension(source, _GLOSSY, place)
+        if glossy is not None:  # a reader that knows this extension ignores pbrMetallicRoughness
             source.pbrMetallicRoughness = read(ITEMS["materials"], {}, "").pbrMetallicRoughness
         fields = self._clamped(self._base(source, glossy, name, place), name)
-        if self._document.extension(source, "KHR_materials_unlit", place) is not None:
+        if document.extension(source, "KHR_materials_unlit", place) is not None:
             fields = _unlit(fields)
         else:
-            fields |= {"kind": "metallic_roughness"} | self._reflection(source, name, place)
-            fields |= self._specular(source, name, place) | self._clearcoat(source, name, place)
-            fields |= self._transmission(source, name, place) | self._emission(source, name, place)
+            fields |= {"kind": "metallic_roughness"} | self._by_keys(source, name, place)
+            ior = document.extension_or_defaults(source, "KHR_materials_ior", place).ior
+            fields["ior"] = ior or 1.5
+            if not ior:  # an index of 0 means the reflectance 1 times the specular factors
+                fields["specular_color"] = [_FULL_REFLECTANCE * channel for channel in fields["specular_color"]]
+            if (normal := source.normalTexture) is not None:
+                fields["normal_texture"] = self._textures.texture(normal, False, name, f"{place}.normalTexture")
+                fields["normal_scale"] = normal.scale
+            if fields.get("transmission"):
+                fields |= self._volume(source, name, place)
+            fields |= self._emission(source, name, place)
             fields |= self._glossy(glossy, name, f"{place}.extensions.{_GLOSSY}") if glossy is not None else {}
         with at(place):
             return Material(**self._clamped(fields, name))
@@ -206,44 +206,36 @@ class Materials:
             "albedo_texture": self._textures.texture(texture, True, name, f"{color}Texture"),
         }
 
-    def _reflection(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        pbr = source.pbrMetallicRoughness
-        fields: dict[str, Any] = {"metallic": pbr.metallicFactor, "roughness": pbr.roughnessFactor}
-        fields["metallic_roughness_texture"] = self._textures.texture(
-            pbr.metallicRoughnessTexture, False, name, f"{place}.pbrMetallicRoughness.metallicRoughnessTexture")
-        if (normal := source.normalTexture) is not None:
-            fields["normal_texture"] = self._textures.texture(normal, False, name, f"{place}.normalTexture")
-            fields["normal_scale"] = normal.scale
+    def _by_keys(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+        """Return the fields in _KEYS."""
+        fields: dict[str, Any] = {}
+        for holder, keys in _KEYS.items():
+            if holder.startswith("KHR"):
+                values, where = self._document.extension_or_defaults(source, holder, place), f"{place}.extensions.{holder}"
+            else:
+                values, where = getattr(source, holder), f"{place}.{holder}"
+            for field, key in keys.items():
+                value = getattr(values, key)
+                if field in _SWITCHES and value == 0.0:
+                    break
+                fields[field] = self._textures.texture(value, SLOTS[field], name, f"{where}.{key}") if field in SLOTS else value
+            if getattr(values, "clearcoatNormalTexture", None) is not None:
+                self._document.left_out.add("clearcoatNormalTexture", "material", name)
         return fields
 
-    def _transmission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+    def _volume(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         """Return the fields of glass: a thin pane, or solid glass if KHR_materials_volume gives a thickness above 0."""
-        transmission = self._document.extension_or_defaults(source, "KHR_materials_transmission", place)
-        if transmission.transmissionFactor == 0.0:
-            return {}
-        fields: dict[str, Any] = {"transmission": transmission.transmissionFactor, "thin": True}
-        fields["transmission_texture"] = self._textures.texture(
-            transmission.transmissionTexture, False, name, f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
         volume = self._document.extension_or_defaults(source, "KHR_materials_volume", place)
-        if volume.thicknessFactor > 0.0:
-            clamp = self._document.mistakes.clamp
-            volume.attenuationColor = clamp(volume.attenuationColor, 0.0, 1.0, "attenuationColor", "material", name)
-            if volume.attenuationDistance <= 0.0:
-                self._document.mistakes.add("attenuationDistance of 0, now infinite", "material", name)
-            fields |= {"thin": False, "absorption": absorption(volume)}
-        return fields
-
-    def _specular(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        """Return the index and the factors on its reflectance. An index of 0 means the reflectance 1 times these factors."""
-        ior = self._document.extension_or_defaults(source, "KHR_materials_ior", place).ior
-        specular = self._document.extension_or_defaults(source, "KHR_materials_specular", place)
-        place = f"{place}.extensions.KHR_materials_specular"
-        return {
-            "ior": ior or 1.5, "specular_factor": specular.specularFactor,
-            "specular_color": tuple((1.0 if ior else _FULL_REFLECTANCE) * channel for channel in specular.specularColorFactor),
-            "specular_texture": self._textures.texture(specular.specularTexture, False, name, f"{place}.specularTexture"),
-            "specular_color_texture": self._textures.texture(specular.specularColorTexture, True, name, f"{place}.specularColorTexture"),
-        }
+        if volume.thicknessFactor <= 0.0:
+            return {"thin": True}
+        distance, mistakes = volume.attenuationDistance, self._document.mistakes
+        color = mistakes.clamp(volume.attenuationColor, 0.0, 1.0, "attenuationColor", "material", name)
+        if distance <= 0.0:
+            mistakes.add("attenuationDistance of 0, now infinite", "material", name)
+        if not 0.0 < distance < math.inf:
+            return {"thin": False}
+        # By Beer-Lambert, exp(-absorption distance) is the colour.
+        return {"thin": False, "absorption": [-math.log(max(channel, _DARKEST)) / distance for channel in color]}
 
     def _glossy(self, glossy: GltfObject, name: str, place: str) -> dict[str, Any]:
         """Return the fields of a surface that has the specular colour as its reflectance at normal incidence.
@@ -261,39 +253,14 @@ class Materials:
             "metallic_roughness_texture": None if texture is None else self._textures.roughness(texture, glossiness),
         }
 
-    def _clearcoat(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        coat = self._document.extension_or_defaults(source, "KHR_materials_clearcoat", place)
-        if coat.clearcoatFactor == 0.0:
-            return {}
-        place = f"{place}.extensions.KHR_materials_clearcoat"
-        if coat.clearcoatNormalTexture is not None:
-            self._document.left_out.add("clearcoatNormalTexture", "material", name)
-        return {
-            "clearcoat": coat.clearcoatFactor, "clearcoat_roughness": coat.clearcoatRoughnessFactor,
-            "clearcoat_texture": self._textures.texture(coat.clearcoatTexture, False, name, f"{place}.clearcoatTexture"),
-            "clearcoat_roughness_texture": self._textures.texture(
-                coat.clearcoatRoughnessTexture, False, name, f"{place}.clearcoatRoughnessTexture"),
-        }
-
     def _emission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         strength = self._document.extension_or_defaults(source, "KHR_materials_emissive_strength", place).emissiveStrength
         emission = tuple(value * strength for value in source.emissiveFactor)
-        if not any(emission):
-            return {}
-        if source.emissiveTexture is None:
+        if not any(emission) or source.emissiveTexture is None:
             return {"emission": emission}
         texture = self._textures.texture(source.emissiveTexture, True, name, f"{place}.emissiveTexture")
-        if texture is None:  # left out with a warning; without a texture the whole surface would glow
-            return {}
-        return {"emission": emission, "emission_texture": texture}
-
-
-def absorption(volume: GltfObject) -> Color:
-    """Return the coefficient a (Beer-Lambert) per unit of world length: exp(-a attenuationDistance) is the attenuationColor."""
-    if math.isinf(volume.attenuationDistance) or volume.attenuationDistance <= 0.0:
-        return BLACK
-    red, green, blue = (-math.log(max(channel, _DARKEST)) / volume.attenuationDistance for channel in volume.attenuationColor)
-    return (red, green, blue)
+        # A texture that is left out leaves no emission: without it, the whole surface would glow.
+        return {"emission": emission if texture else BLACK, "emission_texture": texture}
 
 
 def _unlit(fields: dict[str, Any]) -> dict[str, Any]:

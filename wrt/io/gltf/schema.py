@@ -26,7 +26,7 @@ NAMED = {"name": str, "extensions": ANY}
 TEXTURE = {"index": Needed(int), "texCoord": 0, "extensions": ANY}
 OF_SPARSE = {"bufferView": Needed(int), "byteOffset": 0}
 PRIMITIVE = {"attributes": Needed({str: int}), "indices": int, "material": int, "mode": 4, "targets": [{str: int}], "extensions": ANY}
-FILE = {"scene": int, "extensions": ANY, "extensionsRequired": [str]}
+FILE = {"asset": Needed({"version": Needed(str), "minVersion": str}), "scene": int, "extensions": ANY, "extensionsRequired": [str]}
 # Items of the arrays of a file.
 ITEMS: dict[str, dict[str, Any]] = {
     "accessors": {

@@ -25,7 +25,7 @@ from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CAMERAS, Camera, CameraKind
 from wrt.scene.kinds import Kind, forms
 from wrt.scene.lights import LIGHTS, Light
-from wrt.scene.materials import CONDUCTORS, SLOTS, Checkerboard, Material, Texture
+from wrt.scene.materials import CONDUCTORS, SLOTS, Checkerboard, Material, Texture, kinds_that_use
 from wrt.scene.mesh import Mesh, smooth
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.motion import Motion
@@ -80,7 +80,11 @@ class _Materials:
                 with self.at(f"{place}.{slot}"):
                     values[slot] = self.texture(table[slot], is_color)
         with self.at(place):
-            return Material(name=name, **values)
+            material = Material(name=name, **values)
+            if idle := [key for key in values if not material.reads(key)]:
+                kinds = "; ".join(f"{key} is used by {' and '.join(kinds_that_use()[key])}" for key in idle)
+                raise InputError(f"kind {material.kind!r} does not use {', '.join(idle)}", hint=kinds)
+            return material
         return Material(name=name)
 
     def material_named(self, name: str) -> Material:
@@ -207,7 +211,8 @@ class _Builder(_Materials):
             wanted = {i: by_group.get(mesh.groups[i], table.get("material")) for i in np.unique(mesh.face_group).tolist()}
         for i, material in wanted.items():
             if material is None:
-                raise InputError(f"the triangles of group {mesh.groups[i]!r} have no material", hint="give `material` for the rest")
+                where = f"the triangles of group {mesh.groups[i]!r} have" if by_group else "has"
+                raise InputError(f"{where} no material", hint="give `material`")
         names = {material: i for i, material in enumerate(dict.fromkeys(map(str, wanted.values())))}
         face_material = None
         if by_group and mesh.face_group is not None:
@@ -316,19 +321,19 @@ def transform(table: JsonObject | None) -> np.ndarray:
     matrix = np.eye(4)
     if table is None:
         return matrix
+    placed: JsonObject = STILL | table
     if "matrix" in table:
         matrix = np.array(table["matrix"], np.float64).reshape(4, 4)
-        if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
-            raise InputError("the transform's matrix must be invertible")
-        return matrix
-    placed: JsonObject = STILL | table
-    if "axis" in placed:
-        rotation = _about(np.array(placed["axis"], np.float64), placed["angle"])
     else:
-        x, y, z = (_about(axis, angle) for axis, angle in zip(np.eye(3), placed["rotate"], strict=True))
-        rotation = z @ y @ x
-    matrix[:3, :3] = rotation * placed["scale"]
-    matrix[:3, 3] = placed["translate"]
+        if "axis" in placed:
+            rotation = _about(np.array(placed["axis"], np.float64), placed["angle"])
+        else:
+            x, y, z = (_about(axis, angle) for axis, angle in zip(np.eye(3), placed["rotate"], strict=True))
+            rotation = z @ y @ x
+        matrix[:3, :3] = rotation * placed["scale"]
+        matrix[:3, 3] = placed["translate"]
+    if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
+        raise InputError("the transform must be invertible: neither its scale in any axis nor its axis may be 0")
     return matrix
 
 

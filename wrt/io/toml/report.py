@@ -95,7 +95,7 @@ def _in_table(value: JsonObject, schema: Schema, place: str, tables: Mapping[str
             found += mistakes(each, inside, _join(place, name), tables)
     found += [InputError("is missing", place=_join(place, name)) for name in schema.get("required", ()) if name not in value]
     yield from found
-    if isinstance(schema, Table) and not found and (text := schema.rule(value)):
+    if isinstance(schema, Table) and not found and (text := schema.mistakes(value)):
         yield InputError(text, place=place or "file")
 
 

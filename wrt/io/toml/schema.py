@@ -19,24 +19,35 @@ from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS, Camera, CameraKind
 from wrt.scene.kinds import Kind, forms
 from wrt.scene.lights import LIGHTS
-from wrt.scene.materials import CONDUCTORS, MATERIALS, WRAPS, Checkerboard, Material, kinds_that_use
+from wrt.scene.materials import CONDUCTORS, MATERIALS, WRAPS, Checkerboard, Material
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import SHAPES
 from wrt.scene.values import MAX_REACH, SMALLEST, Limits
 
 Schema = dict[str, Any]
-Rule = Callable[[JsonObject], str]
 BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 
 
 class Table(dict[str, Any]):
-    """Schema of a table. rule: function from a table that fits the schema to what is wrong with its keys together, "" if nothing is."""
+    """Schema of a table. one_of: keys of which exactly one must be given; apart: for a key, the keys that may not stand beside it; needs:
+    for a key, the keys that it needs."""
 
-    def __init__(self, about: str, rule: Rule = lambda table: "", /, **keys: Schema) -> None:
+    def __init__(self, about: str, /, *one_of: tuple[str, ...], apart: Mapping[str, Iterable[str]] | None = None,
+                 needs: Mapping[str, list[str]] | None = None, **keys: Schema) -> None:
         needed = [name for name, value in keys.items() if value.get("needed")]
         properties = {name: {key: each for key, each in value.items() if key != "needed"} for name, value in keys.items()}
-        super().__init__(type="object", description=about, properties=properties, required=needed, additionalProperties=False)
-        self.rule = rule
+        super().__init__(type="object", description=about, properties=properties, required=needed, additionalProperties=False,
+                         **({"dependentRequired": needs} if needs else {}))
+        self.one_of, self.apart = one_of, {**(apart or {})}
+
+    def mistakes(self, table: JsonObject) -> str:
+        """Return what is wrong with the keys of a table together; "" if nothing is."""
+        wrong = [f"give exactly one of {', '.join(names)}" for names in self.one_of if sum(name in table for name in names) != 1]
+        wrong += [f"{name} takes no {', '.join(beside)} beside it" for name, others in self.apart.items()
+                  if name in table and (beside := [other for other in others if other in table])]
+        wrong += [f"{name} needs {', '.join(missing)}" for name, others in self.get("dependentRequired", {}).items()
+                  if name in table and (missing := [other for other in others if other not in table])]
+        return "; ".join(wrong)
 
 
 # --- types of values --------------------------------------------------------------------------------------------------
@@ -137,71 +148,6 @@ def summary(thing: object) -> str:
     return (getattr(thing, "__doc__", None) or "").split("\n\n")[0]
 
 
-# --- keys that go together --------------------------------------------------------------------------------------------
-
-
-def need_one(table: JsonObject, *names: str) -> str:
-    return "" if sum(name in table for name in names) == 1 else f"give exactly one of {', or '.join(names)}"
-
-
-def image_rule(table: JsonObject) -> str:
-    both = "matrix" in table and {"scale", "offset", "rotation"} & table.keys()
-    return "a matrix takes no scale, offset or rotation beside it" if both else ""
-
-
-def color_texture_rule(table: JsonObject) -> str:
-    alone = "a checkerboard takes no other keys beside it; its scale is a key of the checkerboard"
-    return need_one(table, "file", "checkerboard") or (alone if "checkerboard" in table and len(table) > 1 else image_rule(table))
-
-
-def material_rule(table: JsonObject) -> str:
-    users, kind = kinds_that_use(), table.get("kind", "diffuse")
-    users["metal"] = users["eta"]
-    idle = [name for name, kinds in users.items() if name in table and kind not in kinds]
-    if idle:
-        uses = "; ".join(f"{name} is used by {' and '.join(users[name])}" for name in idle)
-        return f"kind {kind!r} does not use {', '.join(idle)} ({uses})"
-    return "give either metal, or eta and k" if "metal" in table and {"eta", "k"} & table.keys() else ""
-
-
-def pose_rule(table: JsonObject) -> str:
-    ways = table.keys() & {"position", "target", "matrix"}
-    if not ways or ("matrix" in ways and len(ways) > 1):
-        return "give either position and target, or matrix"
-    return "" if "matrix" in ways or len(ways) == 2 else "needs both position and target"
-
-
-def lens_rule(table: JsonObject) -> str:
-    wrong = [pose_rule(table)]
-    if "focal_length" in table:
-        wrong += ["give either fov_y or focal_length"] * ("fov_y" in table)
-        wrong += ["focal_length needs a sensor_height"] * ("sensor_height" not in table)
-        wrong += ["focal_length needs either f_number or aperture_radius"] * (("f_number" in table) == ("aperture_radius" in table))
-    elif {"sensor_height", "f_number"} & table.keys():
-        wrong.append("sensor_height and f_number need a focal_length")
-    return "; ".join(filter(None, wrong))
-
-
-def transform_rule(table: JsonObject) -> str:
-    if "matrix" in table:
-        return "a matrix takes no other keys beside it" if len(table) > 1 else ""
-    if ("axis" in table) != ("angle" in table):
-        return "give both axis and angle"
-    if "axis" in table and "rotate" in table:
-        return "give either rotate, or axis and angle"
-    if "axis" in table and not any(table["axis"]):
-        return "axis must not be zero"
-    scale = table.get("scale", 1.0)
-    return "" if all(scale if isinstance(scale, list) else [scale]) else "scale must not be zero in any axis"
-
-
-def mesh_rule(table: JsonObject) -> str:
-    if "materials" in table and "parts" in table:
-        return "give either materials or parts"
-    unpainted = "material" not in table and not table.get("materials") and not table.get("parts")
-    return need_one(table, "file", "shape") or ("needs a material (or materials, or parts)" if unpainted else "")
-
-
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 PLACED = {
@@ -217,6 +163,7 @@ PLACED_IMAGE = {
     "rotation": key(ANGLE, "rotation of the image about uv (0, 0), clockwise", 0.0),
     "matrix": key(numbers(6), "two rows of three: (u, v, 1) to the image's (u, v), in place of scale, offset and rotation"),
 }
+MATRIX_ALONE = {"matrix": ("scale", "offset", "rotation")}
 POSE = {
     "position": key(POINT, "position of the camera"),
     "target": key(POINT, "point in the middle of the picture"),
@@ -246,7 +193,9 @@ SHAPE_KEYS: dict[str, dict[str, tuple[Schema, str]]] = {
 TABLES: dict[str, Table] = {
     "SettingsTable": Table("Defaults of a render; the command line overrides them.", **described(Settings)),
     "TransformTable": Table(
-        "A scale, then a rotation, then a translation; or a matrix.", transform_rule,
+        "A scale, then a rotation, then a translation; or a matrix.",
+        apart={"matrix": ("translate", "rotate", "axis", "angle", "scale"), "axis": ("rotate",)},
+        needs={"axis": ["angle"], "angle": ["axis"]},
         translate=PLACED["translate"], rotate=PLACED["rotate"],
         axis=key(VECTOR, "axis of a rotation, in place of rotate"),
         angle=key(ANGLE, "rotation about axis, counter-clockwise if the axis points to the viewer"),
@@ -272,12 +221,12 @@ TABLES: dict[str, Table] = {
         count=needed(WHOLE | {"minimum": 0}, "number of triangles"), material=MATERIAL),
     "MorphTable": Table(
         "A mesh with the same faces as the mesh to be moved. In an animation, the vertices move to the vertices of this mesh and back.",
-        lambda table: need_one(table, "file", "shape"), file=MESH_FILE, shape=SHAPE),
+        ("file", "shape"), file=MESH_FILE, shape=SHAPE),
     "KeyTable": Table(
         "A placement at one time of an animation: a scale, then a rotation, then a translation. All three are interpolated linearly.",
         **PLACED | {"rotate": PLACED["rotate"] | {"description": "rotation about x, then y, then z; not limited to 360"}}),
     "MeshTable": Table(
-        "A mesh from a file or made by a formula.", mesh_rule, file=MESH_FILE, shape=SHAPE,
+        "A mesh from a file or made by a formula.", ("file", "shape"), apart={"materials": ("parts",)}, file=MESH_FILE, shape=SHAPE,
         material=key(TEXT, "name of a material; with materials or parts, for all other triangles"),
         materials=key(by_name(TEXT), "material of each group of the file (OBJ: usemtl, else g, else o; STL: solid)"),
         parts=key(many(ref("PartTable")), "materials by ranges of triangles; later ranges override earlier ones"),
@@ -295,9 +244,10 @@ TABLES: dict[str, Table] = {
         radiance=needed(RADIANCE, "emitted radiance, the same in all directions"),
         two_sided=key(FLAG, "both sides emit", False), name=NAME),
     "CheckerboardTable": Table("Squares of two alternating colours.", **described(Checkerboard)),
-    "ImageTable": Table("An image file; (u, v) = (0, 0) is its top left.", image_rule, **PLACED_IMAGE, file=needed(*IMAGE_FILE)),
+    "ImageTable": Table("An image file; (u, v) = (0, 0) is its top left.", apart=MATRIX_ALONE, **PLACED_IMAGE, file=needed(*IMAGE_FILE)),
     "ColorTextureTable": Table(
-        "An image file, or a checkerboard.", color_texture_rule, **PLACED_IMAGE, file=key(*IMAGE_FILE),
+        "An image file, or a checkerboard.", ("file", "checkerboard"), apart=MATRIX_ALONE | {"checkerboard": (*PLACED_IMAGE,)},
+        **PLACED_IMAGE, file=key(*IMAGE_FILE),
         checkerboard=key(ref("CheckerboardTable"), "checkerboard, in place of an image file")),
 }
 
@@ -316,7 +266,10 @@ def camera_table(kind: type[CameraKind]) -> Table:
     lens = issubclass(kind, Camera)
     about = "Give position and target, or matrix." + " Give fov_y, or focal_length." * lens
     name = {"type": "string", "const": kind.kind, "default": kind.kind} if kind is Camera else only(kind.kind)
-    return Table(f"{summary(kind)} {about}", lens_rule if lens else pose_rule, type=name, **POSE, **(LENS if lens else {}),
+    apart = {"matrix": ("position",)} | ({"focal_length": ("fov_y",), "f_number": ("aperture_radius",)} if lens else {})
+    needs = {"position": ["target"], "target": ["position"]} | (
+        {"focal_length": ["sensor_height"], "sensor_height": ["focal_length"], "f_number": ["focal_length"]} if lens else {})
+    return Table(f"{summary(kind)} {about}", ("target", "matrix"), apart=apart, needs=needs, type=name, **POSE, **(LENS if lens else {}),
                  **described(kind))
 
 
@@ -334,7 +287,8 @@ def has_name(kind: type[Kind]) -> bool:
 
 def material_table(kinds: tuple[str, ...]) -> Table:
     about = "; ".join(f"{name}: {MATERIALS[name].about}" for name in kinds)
-    return Table("A surface's reflection, transmission and emission.", material_rule, kind=key(among(kinds), about, "diffuse"),
+    return Table("A surface's reflection, transmission and emission.", apart={"metal": ("eta", "k")},
+                 kind=key(among(kinds), about, "diffuse"),
                  metal=key(among(CONDUCTORS), "a metal's eta and k (conductor)"), **described(Material))
 
 
