@@ -199,7 +199,7 @@ assert np.allclose(film.pixels[..., 0], 0.25, atol=1e-5)
 import pickle
 
 from docs.site.scene_format import scene_format
-from wrt.scene.digest import digest
+from wrt.scene.model import digest
 
 (back,) = pickle.loads(pickle.dumps(scene)).cameras
 assert digest(back) == digest(camera)

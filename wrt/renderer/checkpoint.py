@@ -20,7 +20,7 @@ from wrt.core.types import PathLike
 from wrt.renderer.film import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
-from wrt.scene.digest import digest
+from wrt.scene.model import digest
 from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 2\n"

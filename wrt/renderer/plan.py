@@ -27,9 +27,8 @@ from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS
 from wrt.scene.materials import MATERIALS, Checkerboard, Texture
-from wrt.scene.model import Scene
+from wrt.scene.model import Scene, moved_by, moved_camera, scene_origin
 from wrt.scene.settings import SettingChanges, Settings
-from wrt.scene.size import moved_by, moved_camera, scene_origin
 
 # Settings that the kernels do not depend on.
 AIMED = ("size", "spp", "max_depth", "min_throughput", "clamp", "exposure", "tonemap", "auto_exposure")

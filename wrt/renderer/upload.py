@@ -25,8 +25,7 @@ from wrt.picture.tonemap import decode_srgb
 from wrt.scene.backgrounds import Background
 from wrt.scene.cameras import CameraKind
 from wrt.scene.materials import ALPHA_MODES, Checkerboard, Material, Texture, kinds_that_use
-from wrt.scene.model import Scene
-from wrt.scene.size import moved_camera, require_size
+from wrt.scene.model import Scene, moved_camera
 from wrt.scene.values import LUMINANCE, type_of
 
 # If a scene has more emissive objects, they are sampled as one light, by power, since a shadow ray to each would cost too much.
@@ -218,7 +217,6 @@ class DeviceScene:
 
 def warn_left_out(scene: Scene) -> None:
     """Issue a SceneWarning for each part of the scene that a picture leaves out. Raises InputError if the scene cannot be rendered."""
-    require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"a cut-out texture needs a mesh; material {sphere.material.name!r}", place=f"sphere {sphere.name!r}")

@@ -42,8 +42,7 @@ from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import Prepared, kind_of, prepare
 from wrt.renderer.schedule import STEP_SECONDS, Facts, Run, Steps
 from wrt.renderer.upload import warn_left_out
-from wrt.scene.digest import digest
-from wrt.scene.model import Scene
+from wrt.scene.model import Scene, digest
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -14,7 +14,6 @@ from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import MATERIALS, Material
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import quad
-from wrt.scene.size import require_size
 from wrt.scene.values import BLACK, LUMINANCE, SMALLEST, as_number
 
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # Direction from the scene to the camera; the front of glTF is +z, up is +y.
@@ -278,8 +277,7 @@ def stage(scene: Scene, staging: Staging | None = None) -> tuple[Scene, list[str
 
     A scene without a camera gets one that frames it. A scene that is not lit (`is_lit`) gets a key light from above the first camera's
     right shoulder. It also gets a studio if it has surfaces that reflect one (`shines`), else a pale sky. Raises InputError for a scene
-    without cameras and shapes, and for a scene that is too small."""
-    require_size(scene)
+    without cameras and shapes."""
     staging = staging or Staging()
     added = []
     if not scene.cameras:

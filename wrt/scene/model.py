@@ -10,7 +10,8 @@ import contextlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import Any, Self, Unpack
@@ -28,7 +29,19 @@ from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.motion import Motion
 from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
-from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count, shift
+from wrt.scene.values import (
+    BLACK,
+    MAX_REACH,
+    SMALLEST,
+    Color,
+    as_number,
+    as_transform,
+    as_vector,
+    far_origin,
+    require_count,
+    shift,
+    warn_if_alone,
+)
 
 GREY = Material()
 MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` replaces repeated meshes by their boxes
@@ -85,7 +98,6 @@ class Object:
             object.__setattr__(self, "face_material", index)
         if self.motion is not None:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)
-
 
     @property
     def placement(self) -> np.ndarray:
@@ -202,10 +214,8 @@ class Scene:
     def save(self, path: PathLike) -> None:
         """Write a TOML scene file, from which `wrt.load_scene` makes a scene that renders to the same bits.
 
-        Meshes (.npz), textures (.png) and images (.exr) become files in a folder beside it, "room_files" for "room.toml". Their names
-        contain digests, so that a scene saved before stays whole until its file is replaced; its files are not removed.
-        Names that are empty or occur twice change, and materials that no face has are left out. As from any file, a scene without a camera
-        or light gets one when it is read.
+        Meshes (.npz), textures (.png) and images (.exr) become files in a folder beside it, "room_files" for "room.toml". Names that are
+        empty or occur twice change, and materials that no face has are left out.
 
         Parameters
         ----------
@@ -215,8 +225,8 @@ class Scene:
         Raises
         ------
         InputError
-            For another suffix, and if a file cannot be written. Scene files do not hold singular transforms, meshes without triangles,
-            classes that are not registered, and fields without a description (`wrt.scene.kinds.given`).
+            For another suffix, if a file cannot be written, and for what scene files do not hold: singular transforms, meshes without
+            triangles, classes that are not registered, fields without a description (`wrt.scene.kinds.given`).
         """
         path = as_path(path, "path")
         if path.suffix.lower() not in WRITERS:
@@ -250,12 +260,9 @@ class Scene:
             raise InputError("the scene has no camera", hint="give one: camera=wrt.Camera.look_at((0, 1, 5), (0, 0, 0))")
         if name is None:
             return self.cameras[0]
-        for camera in self.cameras:
-            if camera.name == name:
-                return camera
-        for index, camera in enumerate(self.cameras):
-            if str(index) == str(name):
-                return camera
+        named = {str(i): camera for i, camera in enumerate(self.cameras)} | {each.name: each for each in reversed(self.cameras)}
+        if str(name) in named:
+            return named[str(name)]
         known = ", ".join(f"{camera.name!r} (index {i})" for i, camera in enumerate(self.cameras))
         raise InputError(f"the scene has no camera {name!r}", argument="camera", hint=f"its cameras are {known}")
 
@@ -321,3 +328,75 @@ def scene_at(scene: Scene, time: float) -> Scene:
     return replace(scene, objects=tuple(
         replace(thing, mesh=thing.motion.mesh(thing.mesh, time), transform=thing.transform @ thing.motion.transform(time),
                 motion=None) if thing.motion else thing for thing in scene.objects))
+
+
+# --- scenes far from 0 are moved near it in float64, before anything is rounded to float32 ----------------------------
+
+NEAR = 4.0  # an object is near 0 if it is moved by at most this multiple of its own size
+
+
+def scene_origin(scene: Scene) -> np.ndarray | None:
+    """Return a point, (3,) float64, near the middle of the shapes of a scene that is far from 0; None for other scenes."""
+    shown = [thing for thing in scene.objects if len(thing.mesh.faces)]
+    origin = far_origin(*scene.bounds()) if (shown or scene.spheres) and all(map(_is_far, shown)) else None
+    for thing in shown if origin is None else ():
+        if thing.mesh.origin is not None:
+            place, size = thing.placement[:3, 3], _reach(thing)
+            warn_if_alone(place - size, place + size, thing.name or thing.mesh.name or "a mesh")
+    return origin
+
+
+def moved_by(scene: Scene, origin: np.ndarray | None) -> Scene:
+    """Return the scene with `origin` subtracted from all places in float64; None: the scene itself."""
+    if origin is None:
+        return scene
+    return replace(scene, objects=tuple(replace(thing, transform=shift(origin, -1.0) @ thing.transform) for thing in scene.objects),
+                   spheres=tuple(replace(each, center=tuple(each.center - origin)) for each in scene.spheres),
+                   lights=tuple(light.moved(shift(origin, -1.0)) if light.places() else light for light in scene.lights),
+                   cameras=tuple(moved_camera(camera, origin) for camera in scene.cameras))
+
+
+def moved_camera(camera: CameraKind, origin: np.ndarray | None) -> CameraKind:
+    """Return the camera with `origin` subtracted from its place; None: the camera itself."""
+    return camera if origin is None else replace(camera, camera_to_world=shift(origin, -1.0) @ camera.camera_to_world)
+
+
+def _is_far(thing: Object) -> bool:
+    return bool(np.abs(thing.placement[:3, 3]).max() > NEAR * _reach(thing))
+
+
+def _reach(thing: Object) -> float:
+    return float(np.abs(thing.transform[:3, :3]).sum(axis=1).max() * thing.mesh.reach)
+
+
+# Fields that do not enter the digest: they change no pixel, or are a scene's cameras and settings. object: fields of every class.
+LEFT_OUT: dict[type, tuple[str, ...]] = {
+    object: ("name",), Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped"), Object: ("motion",)}
+
+
+def digest(thing: Scene | CameraKind) -> str:
+    """Return the SHA-256, in hexadecimal, of all fields of a scene or a camera except those in LEFT_OUT. Equal ones: equal pictures."""
+    out = sha256()
+    known: dict[int, int] = {}  # what several things share enters once, by its id
+
+    def add(value: Any) -> None:
+        if isinstance(value, tuple):
+            out.update(f"({len(value)} ".encode())
+            for each in value:
+                add(each)
+        elif not (is_dataclass(value) or isinstance(value, np.ndarray)):
+            out.update(f"{value.item() if isinstance(value, np.generic) else value!r} ".encode())
+        elif id(value) in known:
+            out.update(f"{known[id(value)]} ".encode())
+        else:
+            known[id(value)] = len(known)
+            if isinstance(value, np.ndarray):
+                out.update(f"{value.shape}{value.dtype.str}".encode() + np.ascontiguousarray(value).tobytes())
+            else:
+                out.update(type(value).__name__.encode())
+                for each in fields(value):
+                    if each.name not in (*LEFT_OUT[object], *LEFT_OUT.get(type(value), ())):
+                        add(getattr(value, each.name))
+
+    add(thing)
+    return out.hexdigest()

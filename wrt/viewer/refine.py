@@ -21,8 +21,7 @@ from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.render import Renderer
 from wrt.scene.cameras import CameraKind
-from wrt.scene.digest import digest
-from wrt.scene.model import Scene
+from wrt.scene.model import Scene, digest
 
 COARSE = 0.08  # Target time of the first picture after a change, in seconds.
 PATIENCE = 0.5  # Seconds after which the next change interrupts even the first picture.

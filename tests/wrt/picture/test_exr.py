@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import warnings
 from pathlib import Path
 from typing import Any
@@ -107,33 +106,6 @@ def test_whole_numbers_are_kept(tmp_path: Path) -> None:
     assert np.array_equal(read_channels(path)["B"], ids[..., 2])
 
 
-def packed(*more: tuple[bytes, bytes, bytes]) -> bytes:
-    """A file of 2x1 pixels with half B, uint G, float R and uint id, which OpenImageIO does not write exactly. more: attributes."""
-    def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
-        return name + b"\0" + kind + b"\0" + struct.pack("<I", len(value)) + value
-
-    window = struct.pack("<4i", 0, 0, 1, 0)
-    types = {b"B": 1, b"G": 0, b"R": 2, b"id": 0}  # in the order of the alphabet: uint 0, half 1, float 2
-    channels = b"".join(name + b"\0" + struct.pack("<iB3xii", kind, 0, 1, 1) for name, kind in types.items()) + b"\0"
-    header = b"\x76\x2f\x31\x01\2\0\0\0" + b"".join([
-        attribute(b"channels", b"chlist", channels), attribute(b"compression", b"compression", b"\0"),
-        attribute(b"dataWindow", b"box2i", window), attribute(b"displayWindow", b"box2i", window),
-        attribute(b"lineOrder", b"lineOrder", b"\0"), attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1.0)),
-        attribute(b"screenWindowCenter", b"v2f", bytes(8)), attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1.0)),
-        *(attribute(*each) for each in more)]) + b"\0"
-    row = struct.pack("<2e2I2f2I", 0.5, 0.25, 7, 70, 1.5, 2.5, 123456, 9)
-    return header + struct.pack("<Q", len(header) + 8) + struct.pack("<iI", 0, len(row)) + row
-
-
-@pytest.mark.parametrize("more", [(), (b"chromaticities", b"string", b"abc"), (b"chromaticities", b"v2f", bytes(8))], ids=str)
-def test_whole_numbers_beside_halves_and_floats_are_kept(more: tuple[bytes, bytes, bytes], tmp_path: Path) -> None:
-    """An attribute of another type than its own says nothing."""
-    path = tmp_path / "a.exr"
-    path.write_bytes(packed(more) if more else packed())
-    assert read_image(path).tolist() == [[[1.5, 7.0, 0.5], [2.5, 70.0, 0.25]]]
-    assert read_channels(path)["id"].tolist() == [[123456.0, 9.0]]
-
-
 # --- primaries --------------------------------------------------------------------------------------------------------
 
 
@@ -187,13 +159,6 @@ def test_bad_pixels_of_an_environment_are_replaced_and_counted(tmp_path: Path) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.array_equal(read_image(path), pixels, equal_nan=True)  # for `compare`: as the file has it
-
-
-def test_an_infinite_sun_in_other_primaries_stays_white(tmp_path: Path) -> None:
-    pixels = np.array([[[np.inf] * 3, [1.0, 1.0, 1.0]]], np.float32)
-    path = save(tmp_path / "a.exr", (with_primaries(pixels, AP0), pixels))
-    with pytest.warns(SceneWarning, match="1 pixel negative, NaN or infinite"):
-        assert read_image(path, environment=True)[0, 0] == pytest.approx([65504.0] * 3, rel=1e-5)
 
 
 def test_a_cube_map_is_refused(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from PIL import Image
 from tests.picture_metadata import read_metadata
 from tests.refused import refused
 from wrt.picture.decode import decode_rgba8
-from wrt.picture.film import AOV_VIEWS, Film, aov_path, aov_to_srgb8
-from wrt.picture.image import read_channels, read_image
+from wrt.picture.film import AOV_VIEWS, Film, aov_to_srgb8
+from wrt.picture.image import read_channels
 from wrt.picture.tonemap import to_codes
 
 H, W = 12, 17
@@ -59,14 +59,6 @@ def test_exr_holds_every_layer_exactly(film: Film, tmp_path: Path) -> None:
         assert np.array_equal(channels[name].astype(array.dtype), array), name
 
 
-def test_half_exr_keeps_the_layers_in_full(film: Film, tmp_path: Path) -> None:
-    film.save(tmp_path / "a.exr", bits=16, aov=["depth"])
-    channels = read_channels(tmp_path / "a.exr")
-    assert set(channels) == {"R", "G", "B", "depth.Z"}
-    assert np.array_equal(channels["depth.Z"], film.aov["depth"])
-    assert np.array_equal(channels["G"], film.pixels[..., 1].astype(np.float16))
-
-
 def test_png_is_shown_as_the_film_says_and_layers_go_beside_it(film: Film, tmp_path: Path) -> None:
     written = film.save(tmp_path / "a.png", aov=["depth", "prim_id"])
     assert [path.name for path in written] == ["a.png", "a.depth.png", "a.prim_id.png"]
@@ -79,12 +71,6 @@ def test_png_is_shown_as_the_film_says_and_layers_go_beside_it(film: Film, tmp_p
     assert read_metadata(written[0]) == {key: str(value) for key, value in film.metadata.items()}
 
 
-def test_hdr_is_linear(film: Film, tmp_path: Path) -> None:
-    film.save(tmp_path / "a.hdr")
-    assert np.abs(read_image(tmp_path / "a.hdr") - film.pixels).max() <= 4 / 128
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def test_wrong_names_write_nothing(film: Film, tmp_path: Path) -> None:
     with refused("aov", "no AOV 'dept'", hint="depth, normal"):
         film.save(tmp_path / "a.png", aov=["depth", "dept"])
@@ -94,17 +80,6 @@ def test_wrong_names_write_nothing(film: Film, tmp_path: Path) -> None:
     with refused(what="folder", path="a.depth.png"):
         film.save(tmp_path / "a.png", aov=["normal", "depth"])
     assert [path.name for path in tmp_path.iterdir()] == ["a.depth.png"]
-
-
-def test_one_name_stands_for_a_list_of_it(film: Film, tmp_path: Path) -> None:
-    assert film.save(tmp_path / "a.png", aov="depth") == [tmp_path / "a.png", tmp_path / "a.depth.png"]
-    with refused("aov", "one or more names"):
-        film.save(tmp_path / "b.png", aov=5)  # type: ignore[arg-type]
-    assert not (tmp_path / "b.png").exists()
-
-
-def test_layer_paths_keep_dots_in_the_name() -> None:
-    assert aov_path("x/v1.2.hdr", "depth") == Path("x/v1.2.depth.png")
 
 
 def test_notebook_display_is_the_picture(film: Film) -> None:

@@ -31,7 +31,7 @@ from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.render import render
 from wrt.renderer.workers import INSTALLED
-from wrt.scene.digest import digest
+from wrt.scene.model import digest
 
 # The picture is smaller than the smallest default tile, so tile_size is set.
 HOW: dict[str, Any] = {"tile_size": 16}

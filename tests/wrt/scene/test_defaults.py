@@ -9,7 +9,7 @@ import pytest
 
 import wrt
 from tests.refused import refused
-from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import DARK, FILL, Staging, frame_camera, is_lit, stage
 from wrt.scene.lights import DirectionalLight, PointLight
@@ -73,18 +73,6 @@ def test_a_flat_subject_is_seen_face_on(thin, back):
     camera = frame_camera(scene)
     assert camera.camera_to_world[:3, 2] == pytest.approx(np.array(back))
     assert camera.camera_to_world[:3, 1] == pytest.approx(np.array((0, 0, -1) if thin == 1 else (0, 1, 0)))
-
-
-@pytest.mark.parametrize("edge", [(1, 0, 0), (0, 1, 0), (1, 1, 1), (0, 0, 0)])
-def test_a_line_or_a_point_has_a_camera(edge):
-    mesh = Mesh(np.array([(2, 2, 2), np.add((2, 2, 2), edge), (2, 2, 2)], np.float32), np.array([[0, 1, 2]]))
-    camera = frame_camera(Scene(objects=(Object(mesh, (Material(),)),)))
-    assert camera.fov_y > 0.0 and camera.least_fov_x > 0.0
-
-
-def test_view_is_three_quarter_from_above():
-    back = frame_camera(cloud(2)).camera_to_world[:3, 2]
-    assert (back > 0.2).all()  # from the right, from above, from the front (+z)
 
 
 def test_a_complete_scene_is_not_touched():
@@ -156,11 +144,6 @@ def test_emission_lights_a_scene_where_it_would_light_a_white_sphere_around_it(s
         assert is_lit(scene) is lit
         added = stage(scene)[1]
         assert any("no lights but the emission of 'lamp', which is too weak" in each for each in added) is not lit
-
-
-def test_a_background_counts_as_light():
-    assert is_lit(replace(cloud(5), background=ConstantBackground((0.1, 0.1, 0.1))))
-    assert not is_lit(replace(cloud(5), background=ConstantBackground()))
 
 
 def test_nothing_to_frame_is_an_error():

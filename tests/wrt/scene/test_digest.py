@@ -12,10 +12,9 @@ from tests.data import ROOT
 from wrt.io.load import load_scene
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.digest import digest
 from wrt.scene.lights import PointLight, SpotLight
 from wrt.scene.materials import Checkerboard, Material, Texture
-from wrt.scene.model import Object, Scene, Sphere
+from wrt.scene.model import Object, Scene, Sphere, digest
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.refused import refused
-from wrt.io.load import load_scene
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import SpotLight
 from wrt.scene.materials import Material
@@ -31,32 +30,3 @@ def test_a_value_that_rounding_takes_past_its_limit_is_the_limit():
 def test_a_value_further_out_is_refused(angles, name):
     with refused(name):
         spot(**angles)
-
-
-def test_the_same_in_a_scene_file(tmp_path):
-    text = """
-[cameras.main]
-position = [0, 0, 5]
-target = [0, 0, 0]
-[[lights]]
-type = "spot"
-position = [0, 3, 0]
-direction = [0, -1, 0]
-intensity = 1
-outer = {}
-[[spheres]]
-center = [0, 0, 0]
-radius = 1.0
-material = "a"
-[materials.a]
-kind = "metallic_roughness"
-albedo = [1.0000001, 0.5, 0.5]
-roughness = 1.0000001
-"""
-    path = tmp_path / "scene.toml"
-    path.write_text(text.format(math.degrees(HALF)))
-    scene = load_scene(path)
-    assert scene.lights[0].outer == math.pi / 2 and scene.materials[0].albedo == (1.0, 0.5, 0.5) and scene.materials[0].roughness == 1.0
-    path.write_text(text.format(90.01))
-    with refused(what="90"):
-        load_scene(path)

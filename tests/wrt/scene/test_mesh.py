@@ -1,10 +1,15 @@
+"""Meshes: what is refused, trimesh, smooth normals."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.refused import refused
-from wrt.scene.mesh import Mesh
+from wrt.scene.mesh import Mesh, smooth
+from wrt.scene.shapes import box, icosphere, torus
 
 
 def test_mesh_refuses_what_cannot_be_traced() -> None:
@@ -24,16 +29,16 @@ def test_mesh_refuses_what_cannot_be_traced() -> None:
 
 def test_meshes_come_from_trimesh_and_go_back() -> None:
     trimesh = pytest.importorskip("trimesh")
-    box = trimesh.creation.box((1.0, 2.0, 3.0))
-    mesh = Mesh.from_trimesh(box)
+    cuboid = trimesh.creation.box((1.0, 2.0, 3.0))
+    mesh = Mesh.from_trimesh(cuboid)
     assert mesh.normals is None and mesh.uvs is None and len(mesh.faces) == 12
-    np.testing.assert_allclose(mesh.vertices, box.vertices)
-    smooth = Mesh.from_trimesh(box, smooth=True)
-    np.testing.assert_allclose(smooth.normals, box.vertex_normals, atol=1e-6)
-    back = smooth.to_trimesh()
+    np.testing.assert_allclose(mesh.vertices, cuboid.vertices)
+    rounded = Mesh.from_trimesh(cuboid, smooth=True)
+    np.testing.assert_allclose(rounded.normals, cuboid.vertex_normals, atol=1e-6)
+    back = rounded.to_trimesh()
     assert back.is_watertight and back.volume == pytest.approx(6.0)
     np.testing.assert_array_equal(back.faces, mesh.faces)
-    np.testing.assert_allclose(back.vertex_normals, smooth.normals, atol=1e-6)
+    np.testing.assert_allclose(back.vertex_normals, rounded.normals, atol=1e-6)
 
 
 def test_normals_from_trimesh_get_unit_length() -> None:
@@ -62,3 +67,41 @@ def test_texture_coordinates_have_their_origin_where_pictures_have_it() -> None:
     np.testing.assert_array_equal(Mesh.from_trimesh(theirs).uvs, uvs)
     with refused("mesh", "trimesh.Trimesh"):
         Mesh.from_trimesh(trimesh.creation)  # type: ignore[arg-type]
+
+
+# --- smooth normals ---------------------------------------------------------------------------------------------------
+
+
+def test_close_to_the_normals_of_the_surface() -> None:
+    for mesh in (icosphere(3), torus(1.0, 0.4, 96, 48)):
+        made = smooth(replace(mesh, normals=None)).normals
+        assert made is not None and mesh.normals is not None
+        assert (np.einsum("ij,ij->i", made, mesh.normals) > np.cos(np.radians(1.0))).all()
+        np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1.0, atol=1e-6)
+
+
+def test_corner_of_a_box_is_the_diagonal_however_it_is_cut() -> None:
+    # At some corners both triangles of a side meet: weights by angle must not depend on that.
+    mesh = box((-1, -1, -1), (1, 1, 1))
+    normals = smooth(mesh).normals
+    np.testing.assert_allclose(normals, mesh.vertices / np.sqrt(3.0), atol=1e-6)
+
+
+def test_welds_equal_positions_only() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)
+    normals = smooth(Mesh(points, np.array([[0, 1, 2], [3, 4, 5]]))).normals
+    assert normals is not None
+    np.testing.assert_allclose(normals[[0, 3, 2, 4]], np.array([[1, 0, 1]] * 4) / np.sqrt(2.0), atol=1e-6)
+    np.testing.assert_allclose(normals[[1, 5]], [[0, 0, 1], [1, 0, 0]], atol=1e-6)
+
+
+def test_faces_that_cancel_out_are_flat() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
+    assert (smooth(Mesh(points, np.array([[0, 1, 2], [0, 2, 1]]))).normals == 0.0).all()
+
+
+def test_sizes_far_from_one() -> None:
+    for scale in (1e-18, 1e18):
+        mesh = icosphere(1)
+        made = smooth(Mesh(mesh.vertices * np.float32(scale), mesh.faces)).normals
+        np.testing.assert_allclose(made, mesh.normals, atol=0.05)

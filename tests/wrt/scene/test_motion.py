@@ -9,10 +9,9 @@ import pytest
 
 import wrt
 from tests.refused import refused
-from wrt.scene.digest import digest
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Object, Scene, moves, scene_at
+from wrt.scene.model import Object, Scene, digest, moves, scene_at
 from wrt.scene.motion import Motion
 from wrt.scene.shapes import icosphere, torus
 

@@ -33,8 +33,7 @@ from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Scene
-from wrt.scene.size import moved_by, scene_origin
+from wrt.scene.model import Scene, moved_by, scene_origin
 from wrt.scene.values import warn_if_far
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from wrt.core.errors import InputError
 from wrt.scene.clean import flip_collinear
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh, unit_rows
-from wrt.scene.model import Object, Scene
-from wrt.scene.size import moved_by, scene_origin
+from wrt.scene.model import Object, Scene, moved_by, scene_origin
 
 MOST = 2**31 - 2  # faces, and vertices
 
