@@ -284,8 +284,7 @@ class Scene:
     def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield (points, transform) of each object with faces. The points, (N, 3) float64, are in object space; their hull holds the mesh.
 
-        The points are the vertices of the mesh. If all objects together have more than MANY_VERTICES vertices, a shared mesh
-        yields the corners of its box. Otherwise a file with one large mesh at many nodes would take hours."""
+        The points are the vertices; with more than MANY_VERTICES vertices in all, the corners of a shared mesh's box."""
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)
         many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES
@@ -301,9 +300,7 @@ class Scene:
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
         """Return a copy of the scene with changed settings. A setting of None keeps the scene's value; an exposure ends
-        auto_exposure; a size that is one number is a width, and the aspect ratio stays.
-
-        Raises InputError for an unknown setting and for a wrong value."""
+        auto_exposure; a size that is one number is a width, and the aspect ratio stays. Raises InputError for an unknown setting."""
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)
