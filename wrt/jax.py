@@ -10,8 +10,9 @@ import numpy as np
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.accel.queries.rays import from_origin
-from wrt.accel.tensors import HitTensors, at_vertices, hits_of, library
+from wrt.accel.tensors import HitTensors, at_vertices, hits_of
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.core.types import ArrayLike
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, 
     InputError
         Names the argument and what was expected. Also raised if JAX is not installed.
     """
-    jnp = library("jax", "jax.numpy")
+    with needed_by("wrt.jax"):
+        import jax.numpy as jnp
     inputs = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
     *points, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in inputs)
     if o.shape != d.shape or o.shape[1:] != (3,):
@@ -51,7 +53,7 @@ def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, 
 @cache
 def _function() -> Any:
     """Make the JAX function closest_hit(accel, rebuild_at, vertices or None, origins, directions, t_min, t_max) with its gradient."""
-    jax = library("jax")
+    import jax
 
     def on_host(function: Any, shapes: Any, *arrays: Any) -> Any:
         return jax.pure_callback(lambda *each: function(*jax.tree.map(np.asarray, each)), shapes, *arrays, vmap_method="sequential")

@@ -10,8 +10,9 @@ import numpy as np
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.accel.queries.rays import from_origin
-from wrt.accel.tensors import HitTensors, hits_of, library
+from wrt.accel.tensors import HitTensors, hits_of
 from wrt.core.arrays import to_numpy
+from wrt.core.packages import needed_by
 from wrt.core.types import ArrayLike
 
 if TYPE_CHECKING:
@@ -40,20 +41,16 @@ def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, dir
     -------
     HitTensors
         Tensors on the CPU, or on the GPU of `origins`.
-
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected. Also raised if torch is not installed.
     """
-    torch = library("torch")
+    with needed_by("wrt.torch"):
+        import torch
     inputs = (each if each is None else torch.as_tensor(each) for each in (vertices, origins, directions))
     return HitTensors(*_function().apply(accel, rebuild_at, t_min, t_max, *inputs))
 
 
 @cache
 def _function() -> Any:  # a subclass of torch.autograd.Function
-    torch = library("torch")
+    import torch
 
     def as_it_is_on_cpu(each: Any) -> Any:  # far from 0, float64 counts
         return each if each.dtype == torch.float64 and each.device.type == "cpu" else each.float()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -92,23 +92,8 @@ def of_mesh(mesh: wrt.Mesh) -> list[object]:
             *of_structure(wrt.build(wrt.Scene((wrt.Object(mesh),)), movable=True))]
 
 
-def picture(scene: wrt.Scene) -> np.ndarray:
-    return wrt.render(scene, size=(6, 6), spp=1, device="cpu").pixels
-
-
-def scene_of(camera: Any = None, material: wrt.Material | None = None, **fields: Any) -> wrt.Scene:
-    look = wrt.Camera.look_at((0, 0, 3), (0, 0, 0)) if camera is None else camera
-    fields.setdefault("lights", (wrt.PointLight((0, 1, 4), (20, 20, 20)),))
-    return wrt.Scene((wrt.Object(SQUARE, (material or wrt.Material(),)),), cameras=(look,), **fields)
-
-
-def of_camera(camera: Any) -> list[object]:
-    return [camera.camera_to_world, *wrt.camera_rays(camera, (4, 3))]
-
-
-def of_object(thing: wrt.Object) -> list[object]:
-    scene = wrt.Scene((thing, wrt.Object(SQUARE)))
-    return [thing.transform, thing.face_material, *of_structure(wrt.build(scene)), *of_structure(wrt.build(scene, movable=True))]
+def fields_of(made: Any) -> list[object]:
+    return [getattr(made, each.name) for each in fields(made)]
 
 
 def of_sensor(sensor: Any) -> list[object]:
@@ -123,10 +108,6 @@ def of_query(found: Any) -> Any:
 def read_now(found: Any) -> Any:
     """Return what a query has computed. `hits.point` and the like read the rays again, as the docstring of HitPoints says."""
     return [found.t, found.u, found.v, found.prim_id]
-
-
-def material_of(color: np.ndarray) -> wrt.Material:
-    return wrt.Material(albedo=color, emission=color)  # type: ignore[arg-type]
 
 
 def refitted(vertices: np.ndarray, kind: Callable[[np.ndarray], Any] = np.asarray, accel: str = "bvh8", **options: Any) -> Any:
@@ -254,38 +235,29 @@ CALLS: dict[str, Call] = {
     "trace": Call(RAYS, lambda **rays: wrt.trace(wrt.build(BALL), **rays), lambda trace: repr(trace)),
     "walk": Call({name: rays[0] for name, rays in RAYS.items()}, lambda origins, directions: wrt.walk(wrt.build(BALL), origins, directions),
                  lambda walk: [str(walk), repr(walk.as_dict())]),
-    "Object": Call(PATTERN | {"transform": PLACE}, partial(wrt.Object, SQUARE, (wrt.Material(), wrt.Material())), of_object),
-    "Sphere": Call({"center": np.zeros(3)}, lambda center: wrt.Sphere(center, 1.0),
-                   lambda sphere: read_now(wrt.build(wrt.Scene(spheres=(sphere,))).closest_hit(*RAYS.values()))),
-    "Scene": Call({"ambient": np.full(3, 0.5)}, lambda ambient: scene_of(ambient=ambient), picture),
+    "Object": Call(PATTERN | {"transform": PLACE}, partial(wrt.Object, SQUARE, (wrt.Material(), wrt.Material())), fields_of),
+    "Sphere": Call({"center": np.zeros(3)}, lambda center: wrt.Sphere(center, 1.0), fields_of),
+    "Scene": Call({"ambient": np.full(3, 0.5)}, lambda ambient: wrt.Scene(ambient=ambient), fields_of),
     "Scene.of": Call(TRIANGLES, lambda vertices, faces: wrt.Scene.of([(vertices, faces)]), lambda scene: of_structure(wrt.build(scene))),
-    "Texture": Call({"image": IMAGE, "uv_transform": np.float64([[2, 0, 0.5], [0, 2, 0]])}, wrt.Texture,
-                    lambda texture: picture(scene_of(material=wrt.Material(albedo_texture=texture)))),
-    "Checkerboard": Call({"color_a": np.ones(3), "color_b": np.zeros(3)}, wrt.Checkerboard,
-                         lambda texture: picture(scene_of(material=wrt.Material(albedo_texture=texture)))),
-    "Material": Call({"color": np.array([0.25, 0.5, 0.75])}, material_of, lambda made: picture(scene_of(material=made))),
-    "EnvironmentBackground": Call({"image": IMAGE[..., :3].astype(np.float32)}, wrt.EnvironmentBackground,
-                                  lambda made: picture(scene_of(background=made))),
-    "ConstantBackground": Call({"color": np.ones(3)}, wrt.ConstantBackground, lambda made: picture(scene_of(background=made))),
-    "GradientBackground": Call({"top": np.ones(3), "bottom": np.zeros(3)}, wrt.GradientBackground,
-                               lambda made: picture(scene_of(background=made))),
-    "PointLight": Call({"position": TENT["position"], "intensity": TENT["color"]}, wrt.PointLight,
-                       lambda made: picture(scene_of(lights=(made,)))),
-    "DirectionalLight": Call({"direction": TENT["direction"], "irradiance": TENT["color"]}, wrt.DirectionalLight,
-                             lambda made: picture(scene_of(lights=(made,)))),
-    "SpotLight": Call({"position": TENT["position"], "direction": TENT["direction"], "intensity": TENT["color"]}, wrt.SpotLight,
-                      lambda made: picture(scene_of(lights=(made,)))),
-    "Motion": Call({"keys": KEYS}, wrt.Motion, lambda motion: motion.transform(0.3)),
-    "Camera": Call({"camera_to_world": PLACE}, wrt.Camera, of_camera),
-    "Camera.look_at": Call(LOOK, wrt.Camera.look_at, of_camera),
-    "Camera.posed": Call({"matrix": PLACE}, wrt.Camera.posed, of_camera),
-    "OrthographicCamera": Call({"camera_to_world": PLACE}, wrt.OrthographicCamera, of_camera),
-    "FisheyeCamera": Call({"camera_to_world": PLACE}, wrt.FisheyeCamera, of_camera),
-    "PanoramaCamera": Call({"camera_to_world": PLACE}, wrt.PanoramaCamera, of_camera),
-    "Settings": Call({"size": np.array([6, 4])}, wrt.Settings, lambda settings: settings.size),
-    "Options": Call({"crop": np.array([0, 0, 4, 3])}, wrt.Options, lambda options: repr(options)),
+    "Texture": Call({"image": IMAGE, "uv_transform": np.float64([[2, 0, 0.5], [0, 2, 0]])}, wrt.Texture, fields_of),
+    "Checkerboard": Call({"color_a": np.ones(3), "color_b": np.zeros(3)}, wrt.Checkerboard, fields_of),
+    "Material": Call({"albedo": np.array([0.25, 0.5, 0.75]), "emission": np.ones(3)}, wrt.Material, fields_of),
+    "EnvironmentBackground": Call({"image": IMAGE[..., :3].astype(np.float32)}, wrt.EnvironmentBackground, fields_of),
+    "ConstantBackground": Call({"color": np.ones(3)}, wrt.ConstantBackground, fields_of),
+    "GradientBackground": Call({"top": np.ones(3), "bottom": np.zeros(3)}, wrt.GradientBackground, fields_of),
+    "PointLight": Call({"position": TENT["position"], "intensity": TENT["color"]}, wrt.PointLight, fields_of),
+    "DirectionalLight": Call({"direction": TENT["direction"], "irradiance": TENT["color"]}, wrt.DirectionalLight, fields_of),
+    "SpotLight": Call({"position": TENT["position"], "direction": TENT["direction"], "intensity": TENT["color"]}, wrt.SpotLight, fields_of),
+    "Motion": Call({"keys": KEYS}, wrt.Motion, fields_of),
+    "Camera.look_at": Call(LOOK, wrt.Camera.look_at, fields_of),
+    "Camera.posed": Call({"matrix": PLACE}, wrt.Camera.posed, fields_of),
+    **{name: Call({"camera_to_world": PLACE}, getattr(wrt, name), fields_of)
+       for name in ("Camera", "OrthographicCamera", "FisheyeCamera", "PanoramaCamera")},
+    "Settings": Call({"size": np.array([6, 4])}, wrt.Settings, fields_of),
+    "Options": Call({"crop": np.array([0, 0, 4, 3])}, wrt.Options, fields_of),
     "render": Call({"camera_to_world": PLACE, "crop": np.array([0, 0, 4, 3])},
-                   lambda camera_to_world, crop: wrt.render(scene_of(wrt.Camera(camera_to_world)), size=(6, 6), spp=1, crop=crop),
+                   lambda camera_to_world, crop: wrt.render(wrt.Scene((wrt.Object(SQUARE),), cameras=(wrt.Camera(camera_to_world),)),
+                                                            size=(6, 6), spp=1, crop=crop),
                    lambda film: film.pixels),
     "side_by_side": Call({"picture": IMAGE[..., :3]}, lambda picture: wrt.side_by_side({"": picture}), np.asarray),
     "sensors.pinhole": Call({"intrinsics": K, "pose": PLACE, "distortion": np.array([0.01, 0, 0, 0])},

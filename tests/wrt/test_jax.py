@@ -52,16 +52,6 @@ def test_values_and_batches() -> None:
         wrt.jax.closest_hit(accel, None, origins, directions[:, :2])
 
 
-def test_arrays_in_arrays_out() -> None:
-    accel, (o, d) = wrt.build(shapes.icosphere(2)), map(jax.numpy.asarray, rays(np.random.default_rng(2), 100))
-    hits = accel.closest_hit(o, d)
-    for each in (hits.t, hits.prim_id, hits.point, accel.any_hit(o, d), wrt.all_hits(accel, o, d).t, wrt.visible(accel, o, d)):
-        assert isinstance(each, jax.Array)
-    np.testing.assert_array_equal(hits.t, accel.closest_hit(np.asarray(o), np.asarray(d)).t)
-    with pytest.raises(InputError, match=r"origins: .*wrt.jax"):
-        jax.jit(lambda o: accel.closest_hit(o, d).t)(o)
-
-
 def test_far_from_0_gradients_are_those_of_0() -> None:
     ball, place = shapes.icosphere(3), np.float32([4096.0, 8192.0, 0.0])
     vertices, origin, direction = (ball.vertices * 64).round() / 64, np.float32([[0.125, 0.25, 5.0]]), np.float32([[0.0, 0.125, -1.0]])

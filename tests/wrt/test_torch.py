@@ -102,23 +102,6 @@ def test_vertices_that_are_written_to_are_followed() -> None:
             assert (expected.prim_id >= 0).any() and torch.equal(found.t, expected.t)
 
 
-def test_tensors_in_tensors_out() -> None:
-    torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
-    accel, (o, d) = wrt.build(shapes.icosphere(2)), map(torch.tensor, rays(np.random.default_rng(9), 100))
-    hits, found = accel.closest_hit(o, d), wrt.all_hits(accel, o, d)
-    answers = [hits.t, hits.prim_id, hits.point, hits.normal, hits.gradients(t=hits.u).origins, accel.any_hit(o, d), found.t,
-               found.first, found.counts, found.ray_id, wrt.count_hits(accel, o, d), wrt.first_hits(accel, 2, o, d).t,
-               wrt.contains(accel, o), wrt.visible(accel, o, d), wrt.visible(accel, o, d, on_a=hits.prim_id)]
-    assert all(isinstance(each, torch.Tensor) for each in answers)
-    where = hits.t.data_ptr()
-    again = accel.closest_hit(d, -d, out=hits)
-    assert again.t.data_ptr() == hits.t.data_ptr() == where
-    np.testing.assert_array_equal(hits.t, accel.closest_hit(d.numpy(), -d.numpy()).t)
-    accel.refit(2.0 * torch.tensor(accel.geometry.vertices))
-    with pytest.raises(InputError, match=r"requires? grad.*wrt.torch"):
-        accel.closest_hit(o.clone().requires_grad_(), d)
-
-
 def test_what_the_page_says_runs() -> None:
     torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
     page = (ROOT / "docs" / "gradients.md").read_text(encoding="utf-8")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-from types import ModuleType
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -13,7 +11,6 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.core.arrays import to_numpy
-from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, ArrayT
 from wrt.scene.values import near_zero, shift
 
@@ -52,11 +49,3 @@ def at_vertices(geometry: Geometry, vertices: np.ndarray) -> Geometry:
     """Return the geometry with other vertices (V, 3)."""
     near, origin = near_zero(vertices)
     return Geometry(near, geometry.faces, geometry.spheres, origin)
-
-
-def library(name: str, module: str = "") -> ModuleType:
-    """Import an optional library. If it is missing, raise InputError that says how to install it."""
-    try:
-        return importlib.import_module(module or name)
-    except ImportError as error:
-        raise InputError(f"wrt.{name} needs {name} ({error})", hint=f'pip install "wrt[{name}]"') from error

@@ -13,15 +13,14 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from wrt.accel.points.closest_points import closest_points
-from wrt.accel.points.contains import odd_crossings
-from wrt.accel.points.enclosing import enclosing
+from wrt.accel.points.contains import enclosing, odd_crossings
 from wrt.accel.queries.all_hits import ListQuery
+from wrt.accel.queries.arguments import of_each
 from wrt.accel.queries.batches import MadeRays, trace_made
 from wrt.accel.queries.lists import begins
 from wrt.accel.queries.raw_launches import RowKernel
 from wrt.accel.queries.rays import vectors
-from wrt.compat.joined_meshes import JoinedMeshes
-from wrt.compat.surfaces import every_hit, hit_counts, scatter
+from wrt.compat.common import JoinedMeshes, every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
@@ -138,7 +137,8 @@ class RaycastingScene:
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
             return _answer(trace_made(accel.snapshot, _split(rows), True, threads)[0], shape)
         origins, directions, t_min, t_max = map(np.asarray, _split(rows).rays(threads))
-        near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
+        near, far = (np.broadcast_to(float32(of_each(value, (len(rows),), name)), len(rows)) for value, name in (
+            (tnear, "tnear"), (tfar, "tfar")))
         end = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
         hit = accel.any_hit(origins, directions, np.fmax(near, np.float32(0.0)), np.minimum(t_max, end), threads)
         if (near < 0.0).any():
@@ -243,14 +243,6 @@ class RaycastingScene:
 
 def _threads(nthreads: int) -> int:
     return thread_count(max(as_integer(nthreads, "nthreads", -(1 << 31), (1 << 31) - 1), 0) or None)
-
-
-def _ends(value: Any, n: int, name: str) -> np.ndarray:
-    """Convert an end of the segments of n rays to an array (n,) float32."""
-    ends = float32(_numbers(value, name, f"a number or ({n},)"))
-    if ends.shape not in ((), (n,)):
-        raise InputError(f"must be a number or ({n},), got {ends.shape}", argument=name)
-    return np.ascontiguousarray(np.broadcast_to(ends, n))
 
 
 def _numbers(value: Any, name: str, shape: str) -> np.ndarray:

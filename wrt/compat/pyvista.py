@@ -128,14 +128,7 @@ def to_mesh(polydata: pyvista.PolyData) -> Mesh:
     Parameters
     ----------
     polydata : pyvista.PolyData
-        Mesh of triangles; its points are rounded to float32.
-
-    Raises
-    ------
-    pyvista.NotAllTrianglesError
-        If the mesh has cells that are not triangles.
-    InputError
-        If a point is not finite.
+        Mesh of triangles with finite points, which are rounded to float32; for other cells, pyvista.NotAllTrianglesError is raised.
     """
     points, faces = _triangles(polydata, "to_mesh")
     normals, uvs = polydata.point_data.active_normals, polydata.active_texture_coordinates
@@ -155,11 +148,6 @@ def to_polydata(mesh: Mesh) -> pyvista.PolyData:
     -------
     pyvista.PolyData
         Points (V, 3), float32 or, of a mesh with an origin, float64; and F triangles.
-
-    Raises
-    ------
-    InputError
-        If PyVista is missing.
     """
     with needed_by("a mesh of PyVista"):
         import pyvista

@@ -6,18 +6,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.points.closest_points import closest_points
-from wrt.accel.points.contains import contains, open_edges_of
-from wrt.accel.points.enclosing import enclosing
+from wrt.accel.points.contains import contains, enclosing, open_edges_of
 from wrt.accel.queries.batches import MadeRays, trace_made
 from wrt.accel.queries.raw_launches import RowKernel
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import every_hit, hit_counts
+from wrt.compat.common import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -131,21 +131,14 @@ class RayMeshIntersector:
         inside = ((points >= scaled.low) & (points <= scaled.high)).all(axis=1)
         if inside.any():
             near = points[inside]
-            inside[inside] = scaled.contains(near) if scaled.closed else contains_points(_Counter(self.mesh, scaled), near)
+            if open_edges_of(enclosing(scaled.accel).snapshot):
+                inside[inside] = contains_points(self, near)
+            else:
+                inside[inside] = contains(scaled.accel, scaled.to_local(near), threads=scaled.threads)
         return inside
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"mesh": self.mesh, "_options": self._options}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._cache = Cache(id_function=self.mesh.__hash__)
-
-    def __copy__(self) -> RayMeshIntersector:
-        return type(self)(self.mesh, **self._options)
-
-    def __deepcopy__(self, memo: Any) -> RayMeshIntersector:
-        return self.__copy__()
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy and a pickled one build their own structure
+        return partial(type(self), **self._options), (self.mesh,)
 
 
 class _ScaledStructure:
@@ -179,10 +172,6 @@ class _ScaledStructure:
         place.scale, place.scale_again = 2.0**half_way, 2.0**(self.exponent - half_way)
         place.radius, place.near = radius, FAR * radius
         self.placement = record_of(place)
-
-    @property
-    def closed(self) -> bool:
-        return open_edges_of(enclosing(self.accel).snapshot) == 0
 
     def given(self, face: np.ndarray) -> np.ndarray:
         """Return the mesh's face for each face of the structure, where collinear faces are flipped; -1 stays."""
@@ -222,24 +211,6 @@ class _ScaledStructure:
         corners = self.vertices[self.faces[face]]
         near = np.linalg.norm(closest_point(corners[None], point[None])[0] - point) <= reach
         return face if near and np.cross(corners[1] - corners[0], corners[2] - corners[0]).any() else -1
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        return contains(self.accel, self.to_local(points), threads=self.threads)
-
-
-class _Counter(NamedTuple):
-    """The part of a ray class that trimesh's contains_points uses: it only counts the hits of each ray."""
-
-    mesh: trimesh.Trimesh
-    scaled: _ScaledStructure
-
-    def intersects_location(self, origins: np.ndarray, directions: np.ndarray,
-                            multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
-        """Return the ray of each hit, (M,) int64, in the second place."""
-        scaled = self.scaled
-        rays = scaled.placed(origins, directions).rays(scaled.threads)
-        counts = np.minimum(hit_counts(enclosing(scaled.accel), rays, scaled.threads), MAX_HITS)
-        return None, np.repeat(np.arange(len(counts)), counts), None
 
 
 def _rows(value: ArrayLike, name: str) -> np.ndarray:

@@ -14,8 +14,9 @@ import warp as wp
 
 from wrt.accel.bvh.wide_tree import stack_need
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.arguments import rays_of
 from wrt.accel.queries.batches import FEWEST, LEAST, MOST, SHARES, new_scratch, parts, tracer
-from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.queries.rays import rays_on
 from wrt.accel.scenes.build import build
 from wrt.accel.snapshot import Built, Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
@@ -41,7 +42,7 @@ def new_hits(n):
 
 def one_by_one(accel, o, d, t_min, t_max):
     """Return closest hits and any hits by the kernel for one ray."""
-    rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)), len(o)
+    rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)[0]), len(o)
     hits = new_hits(n)
     launch(closest_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, rays, hits, 0)
     dark = zeros(n, wp.bool)
@@ -261,7 +262,7 @@ def test_packets_are_given_up_where_they_fall_apart(any_hit, side):
         scratch = new_scratch(BatchTraversal.stream_sizes)
         d = np.tile([0.001, 0.001, -1.0], (n, 1)) * np.where(np.arange(n) % 2, side, 1.0)[:, None] ** [1, 1, 0]
         assert_same(accel, o, d)
-        rays = rays_on(accel.device, rays_of(o, d, 0.0, np.inf))
+        rays = rays_on(accel.device, rays_of(o, d, 0.0, np.inf)[0])
         out = wp.zeros(n, dtype=wp.bool, device=DEVICE) if any_hit else new_hits(n)
         inputs = [accel.data, accel.snapshot.surfaces, rays, out, scratch, 0, n]
         wp.launch(tracer(accel.structure, any_hit).kernel, 1, inputs, device=DEVICE)

@@ -14,9 +14,8 @@ import wrt  # isort: skip (after Warp is started)
 import warp as wp
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, answer_arrays
-from wrt.accel.queries.batches import Query, new_scratch, trace_worlds, tracer, world_tracer
-from wrt.accel.queries.rays import rays_of
-from wrt.accel.queries.world_ids import check_world
+from wrt.accel.queries.arguments import check_world, rays_of
+from wrt.accel.queries.batches import Query, new_scratch, trace_one_by_one, tracer, world_tracer
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.snapshot import Structure
@@ -132,11 +131,11 @@ def test_rays_of_several_worlds(together):
     accel = wrt.build([scene(5, 0), icosphere(1), scene(1, 3), scene(20, 4)], threads=1)
     o, d, t_min, t_max = mixed_rays(4000, 9)
     ids = wp.array(np.random.default_rng(0).integers(-1, 6, 4000).repeat(together)[:4000].astype(np.int32), device="cpu")
-    rays, worlds = rays_of(o, d, t_min, np.maximum(t_max, t_min)), check_world(accel.snapshot, ids, 4000)
+    rays, worlds = rays_of(o, d, t_min, np.maximum(t_max, t_min))[0], check_world(accel.snapshot, ids, (4000,))
     for types, query in ((HIT_TYPES, accel.closest_hit), (ANY_HIT_TYPES, accel.any_hit)):
         assert world_tracer(accel.structure, types is ANY_HIT_TYPES).stream is not None
-        expected = answer_arrays(types, None, 4000, None, False)
-        trace_worlds(accel.snapshot, Query(rays, expected, 1, worlds), worlds)
+        expected = answer_arrays(types, None, (4000,), None)
+        trace_one_by_one(accel.snapshot, Query(rays, expected, 1, worlds))
         for threads, some in ((1, slice(None)), (2, slice(None)), (1, slice(705))):  # 705: the last packet has one ray
             found = query(o[some], d[some], t_min[some], np.maximum(t_max, t_min)[some], threads, world=ids[some])
             found = [found.t, found.u, found.v, found.prim_id] if types is HIT_TYPES else [found]

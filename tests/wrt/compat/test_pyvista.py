@@ -112,25 +112,6 @@ def test_segments_that_end_short_of_the_mesh_and_those_without_length() -> None:
         assert tracer.ray_trace(*ends)[0].shape == (0, 3)
 
 
-def test_points_stay_on_rays_along_an_axis() -> None:
-    ball = pv.PolyData.from_regular_faces(np.array(pv.Sphere().points, np.float64), pv.Sphere().regular_faces)
-    grid = np.stack(np.meshgrid(np.arange(-4, 5) * 0.1, np.arange(-4, 5) * 0.1), axis=-1).reshape(-1, 2)
-    origins = np.column_stack([np.full(len(grid), -5.0), grid])
-    points, ray, _ = RayTracer(ball).multi_ray_trace(origins, np.tile([1.0, 0.0, 0.0], (len(grid), 1)))
-    assert len(points) > 80 and np.array_equal(points[:, 1:], origins[ray, 1:])
-    for origin in origins[::7]:
-        assert (RayTracer(ball).ray_trace(origin, origin * [-1, 1, 1])[0][:, 1:] == origin[1:]).all()
-
-
-def test_arguments_of_plots_and_meshes_without_cells() -> None:
-    plate = pv.Plane().triangulate()
-    assert len(RayTracer(plate).ray_trace([0.1, 0.2, 1], [0.1, 0.2, -1], False, False, None)[1]) == 1
-    with refused("plot", "draws nothing"):
-        RayTracer(plate).ray_trace([0, 0, 1], [0, 0, -1], plot=True)
-    with pytest.raises(pv.NotAllTrianglesError, match="It has no cells"):
-        RayTracer(pv.PolyData()).ray_trace([0, 0, 1], [0, 0, -1])
-
-
 def test_wrt_build_names_the_function() -> None:
     with refused("mesh", "got a pyvista.PolyData", hint="to_mesh"):
         wrt.build(pv.Cube())

@@ -120,36 +120,6 @@ def test_counts_of_closed_meshes_are_exact(mesh: wrt.Mesh) -> None:
     assert 0.04 < np.mean(seen_inside) < 0.8 and 0.1 < np.mean(seen_sure) < 0.9 and len(seen_sure) > 1000
 
 
-CONVEX = {"box": trimesh.creation.box(), "icosahedron": trimesh.creation.icosahedron(),
-          "icosphere": trimesh.creation.icosphere(subdivisions=3), "grid": trimesh.creation.box().subdivide().subdivide()}
-
-
-@pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
-def test_no_ray_at_a_corner_hits_a_convex_body_more_than_twice(mesh: trimesh.Trimesh) -> None:
-    rng = np.random.default_rng(0)
-    target = mesh.vertices[rng.integers(len(mesh.vertices), size=20_000)]
-    origins = trimesh.unitize(rng.normal(size=target.shape))
-    for distance in (4.0, 0.1):  # from outside, and from inside
-        for counts, hit in adapters(mesh.vertices, mesh.faces, distance * origins, target - distance * origins):
-            assert np.array_equal(counts, (2 if distance > 1.0 else 1) * hit)
-            assert hit.mean() > 0.5 and (distance > 1.0 or hit.all())
-
-
-def test_a_ray_from_inside_a_box_beside_an_edge_leaves_it_once() -> None:
-    box = trimesh.creation.box()
-    origin = np.array([[0.02244718372821808, -0.001997743034735322, 0.012886442244052887]])
-    direction = np.array([[0.4775528013706207, 0.5019977688789368, -0.5128864645957947]])
-    assert [counts.tolist() for counts, _ in adapters(box.vertices, box.faces, origin, direction)] == [[1], [1]]
-    assert RayMeshIntersector(box).intersects_id(origin, direction)[1].tolist() == [0]
-
-
-@pytest.mark.parametrize("last", [[1, 0, 3], [0, 1, 3]])
-def test_the_winding_of_two_faces_does_not_matter_at_their_edge(last: list[int]) -> None:
-    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0]]
-    for counts, _ in adapters(vertices, [[0, 1, 2], last], [[0.5, 0, 1]], [[0, 0, -1]]):
-        assert counts.tolist() == [1]
-
-
 def test_an_open_sheet_is_hit_once_wherever() -> None:
     turn = 2.0 * np.pi * np.arange(5) / 5
     fan = np.float32(np.stack([np.append(0.0, np.cos(turn)), np.append(0.0, np.sin(turn)), np.zeros(6)], axis=1))

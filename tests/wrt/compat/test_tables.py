@@ -75,43 +75,6 @@ def test_rows_for_open3d() -> None:
     assert np.isnan(own["hits"].normal[misses]).all() and not names["answer"]["primitive_normals"].numpy()[misses].any()
 
 
-def test_meshes_and_cameras_of_open3d() -> None:
-    o3d = pytest.importorskip("open3d", reason="Open3D is not installed")
-    old = o3d.geometry.TriangleMesh.create_box()
-    new = o3d.t.geometry.TriangleMesh.from_legacy(old)
-    rays = np.float32([[0.3, 0.4, 5, 0, 0, -1]])
-    for arrays in ((old.vertices, old.triangles), (new.vertex.positions, new.triangle.indices)):
-        assert wrt.build(arrays).closest_hit(rays).t.tolist() == [4.0]
-    pose, K = np.eye(4), np.array([[40.0, 0, 16], [0, 41, 12], [0, 0, 1]])
-    pose[:3, 3] = 1, 2, 3
-    theirs = o3d.t.geometry.RaycastingScene.create_rays_pinhole(K, np.linalg.inv(pose), 32, 24).numpy()
-    ours = wrt.sensors.pinhole(K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], (32, 24), pose)  # from a pixel's centre
-    same(np.concatenate([ours.origins, ours.directions], axis=1), theirs.reshape(-1, 6))
-
-
-def test_rows_for_pyvista() -> None:
-    pv = pytest.importorskip("pyvista", reason="PyVista is not installed")
-    pytest.importorskip("embreex", reason="PyVista needs embreex for many rays")
-    from wrt.compat.pyvista import RayTracer, to_mesh, to_polydata
-
-    ball = to_polydata(MESHES[0])
-    tracer, plate = RayTracer(ball), pv.Plane(i_resolution=1, j_resolution=1).triangulate()
-    rays = RAYS[:, :3].astype(float), RAYS[:, 3:].astype(float)
-    for mine, other in zip(tracer.multi_ray_trace(*rays), ball.multi_ray_trace(*rays), strict=True):
-        same(mine, other)
-    ends = [-2, 0.1, 0.2], [2, 0.1, 0.2]
-    assert tracer.ray_trace(*ends, first_point=True)[0][0] < 0 < ball.ray_trace(*ends, first_point=True)[0][0]
-    in_plane = [-1, 0.1, 0], [1, 0.1, 0]
-    assert len(plate.ray_trace(*in_plane)[1]) == 2 and len(RayTracer(plate).ray_trace(*in_plane)[1]) == 0
-    many = [[-1, 0.1, 0]], [[1.0, 0, 0]]
-    assert len(plate.multi_ray_trace(*many, retry=True)[1]) == 2 and len(RayTracer(plate).multi_ray_trace(*many, retry=True)[1]) == 0
-    with pytest.raises(pv.NotAllTrianglesError):
-        RayTracer(pv.Cube()).ray_trace(*ends)
-    with pytest.raises(ValueError, match="points and cells"):
-        pv.PolyData().ray_trace(*ends)
-    assert np.array_equal(to_mesh(ball).faces, MESHES[0].faces)
-
-
 def test_rows_for_trimesh_with_rtree() -> None:
     """Points, distances and sides agree; at edges and corners the faces differ, and a face's normal is no side."""
     trimesh = pytest.importorskip("trimesh")
@@ -127,45 +90,6 @@ def test_rows_for_trimesh_with_rtree() -> None:
     signed = trimesh.proximity.signed_distance(wedge, points)
     same(-wrt.signed_distance(accel, points), signed.astype(np.float32))
     same(wrt.contains(accel, points), signed > 0)
-
-
-def test_rows_for_embree() -> None:
-    pytest.importorskip("embreex", reason="embreex is not installed")
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    for mesh in MESHES:
-        TriangleMesh(scene, mesh.vertices[mesh.faces])
-    rays = np.ascontiguousarray(RAYS[:, :3]), np.ascontiguousarray(RAYS[:, 3:])
-    theirs, hits = scene.run(*rays, output=True), wrt.build(wrt.Scene.of(MESHES)).closest_hit(*rays)
-    hit = theirs["primID"] >= 0
-    assert np.array_equal(hits.hit, hit) and np.array_equal(hits.hit, scene.run(*rays, query="OCCLUDED") >= 0)
-    same(hits.face[hit], theirs["primID"][hit])
-    same(hits.object[hit], theirs["geomID"][hit])
-    for ours, name in ((hits.t, "tfar"), (hits.u, "u"), (hits.v, "v")):
-        same(ours[hit], theirs[name][hit])
-    same(hits.normal[hit], theirs["Ng"][hit] / np.linalg.norm(theirs["Ng"][hit], axis=1, keepdims=True))
-
-
-def test_rows_for_mitsuba() -> None:
-    mi = pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
-    mi.set_variant("scalar_rgb")
-    parts: dict[str, Any] = {"type": "scene"}
-    for i, mesh in enumerate(MESHES):
-        part = mi.Mesh(f"m{i}", len(mesh.vertices), len(mesh.faces))
-        of = mi.traverse(part)
-        of["vertex_positions"], of["faces"] = mesh.vertices.ravel(), mesh.faces.ravel()
-        of.update()
-        parts[f"m{i}"] = part
-    scene, hits = mi.load_dict(parts), wrt.build(wrt.Scene.of(MESHES)).closest_hit(RAYS)
-    for i, row in enumerate(RAYS[:100]):
-        ray = mi.Ray3f(mi.Point3f(*map(float, row[:3])), mi.Vector3f(*map(float, row[3:])))
-        si = scene.ray_intersect(ray)
-        assert si.is_valid() == scene.ray_test(ray) == hits.hit[i]
-        if hits.hit[i]:
-            assert si.prim_index == hits.face[i]
-            same(np.float32([si.t, *si.p, *si.n]), np.float32([hits.t[i], *hits.point[i], *hits.normal[i]]))
 
 
 MODEL = """<mujoco><asset><mesh name="a" file="a.obj" scale="1 2 1"/><mesh name="b" file="b.obj"/></asset><worldbody>
@@ -201,12 +125,3 @@ def test_rows_for_mujoco() -> None:
     assert np.abs(hits.t - t)[hits.hit].max() < 1e-5
     mesh_geoms = np.flatnonzero(model.geom_type == 7)
     assert np.array_equal(mesh_geoms[hits.object[hits.hit]], geom[hits.hit, 0])
-
-
-def test_rows_for_newton() -> None:
-    newton = pytest.importorskip("newton", reason="Newton is not installed")
-    mesh = newton.Mesh(MESHES[1].vertices, MESHES[1].faces.ravel())
-    hits = wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))).closest_hit(RAYS)
-    assert np.array_equal(hits.prim_id, wrt.build(MESHES[1]).closest_hit(RAYS).prim_id)
-    with pytest.raises(wrt.InputError, match=r"got a newton\.Mesh.*reshape\(-1, 3\)"):
-        wrt.build(mesh)

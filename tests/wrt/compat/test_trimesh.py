@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from trimesh.ray.ray_util import contains_points
 
 import wrt
 from tests.refused import refused
@@ -59,21 +58,6 @@ def test_trimesh_says_the_same(call: Callable[..., tuple[np.ndarray, ...]]) -> N
         for a, b in zip(mine, other, strict=True):
             assert a.dtype == b.dtype and a.shape == b.shape and type(a) is np.ndarray
             assert np.allclose(a, b, rtol=0.0, atol=1e-12) if a.dtype == np.float64 else np.array_equal(a, b)
-
-
-@pytest.mark.parametrize("merged", [True, False])
-def test_a_ray_through_an_edge_or_a_corner_meets_each_surface_once(merged: bool) -> None:
-    box = trimesh.creation.box()
-    if not merged:  # each face has separate corners, as in glTF and STL files
-        box = trimesh.Trimesh(box.vertices[box.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
-    ray = RayMeshIntersector(box)
-    origins, directions = lattice()
-    inside = (np.abs(origins[:, :2]) < 0.5).all(axis=1)
-    assert (counts(ray, origins, directions)[inside] == 2).all()
-    corners = trimesh.creation.box().vertices
-    assert (counts(ray, 0.0 * corners, corners) == 1).all()  # from the centre outwards
-    assert (counts(ray, 2.0 * corners, -corners) == 2).all()
-    assert ray.intersects_any(origins, directions).all() and (ray.intersects_first(origins, directions) >= 0).all()
 
 
 def test_surfaces_in_the_same_place_are_all_there() -> None:
@@ -181,9 +165,6 @@ def test_rays_that_are_none_hit_nothing_and_directions_have_any_length() -> None
     for wrong in (origins[:3], origins[0], origins[:, :2]):
         with refused("ray_origins", "ray_directions"):
             ray.intersects_first(wrong, directions)
-    for numbers in ("rays", [[1j, 0, 0]]):
-        with refused("ray_directions", "(N, 3)"):
-            ray.intersects_first(origins[:1], numbers)
     assert [array.shape for array in ray.intersects_location([], [])] == [(0, 3), (0,), (0,)]
 
 
@@ -205,9 +186,8 @@ def test_points_inside() -> None:
     ray = RayMeshIntersector(trimesh.creation.box())
     assert ray.contains_points([[np.nan, 0.0, 0.0], [0.0, 0.0, 0.0], [1e300, 0.0, 0.0]]).tolist() == [False, True, False]
     assert ray.contains_points(np.zeros((0, 3))).shape == ray.contains_points([]).shape == (0,)
-    for wrong in ([0.0, 0.0, 0.0], [[1j, 0.0, 0.0]]):
-        with refused("points", "(N, 3)"):
-            ray.contains_points(wrong)
+    with refused("points", "(N, 3)"):
+        ray.contains_points([0.0, 0.0, 0.0])
 
 
 def test_points_inside_of_an_open_mesh_go_by_the_rule_of_trimesh() -> None:
@@ -217,27 +197,6 @@ def test_points_inside_of_an_open_mesh_go_by_the_rule_of_trimesh() -> None:
     radius = np.linalg.norm(points, axis=1)
     inside = RayMeshIntersector(ball).contains_points(points)
     assert inside[radius < 0.9].mean() > 0.98 and not inside[radius > 1.0].any()
-
-
-def sheets(n: int) -> trimesh.Trimesh:
-    """Return n triangles above each other."""
-    corners = np.repeat([[[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 9.0, 0.0]]], n, axis=0)
-    corners[:, :, 2] = np.linspace(-0.5, 0.5, n)[:, None]
-    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3), process=False)
-
-
-@pytest.mark.parametrize("mesh", [trimesh.Trimesh(trimesh.creation.box().vertices, trimesh.creation.box().faces[1:], process=False),
-                                  sheets(3), sheets(230)], ids=["box", "sheets", "more hits than are counted"])
-def test_points_inside_of_an_open_mesh_are_those_of_the_rule_with_all_hits(mesh: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    # For points where two rays disagree, trimesh draws a direction; trimesh 4 draws it from numpy.random.
-    monkeypatch.setattr("trimesh.util.random_generator", lambda: np.random.default_rng(4), raising=False)
-    monkeypatch.setattr("numpy.random.random", lambda size: np.random.default_rng(4).random(size))
-    around = np.random.default_rng(5).uniform(-0.6, 0.6, (400, 3))
-    to_edges = 0.5 * np.eye(3)[[0, 1, 2]].repeat(2, axis=0) - np.outer([0.1, 0.2, 0.1, 0.2, 0.1, 0.2], TRIMESH_DIRECTION)
-    ray = RayMeshIntersector(mesh)
-    for points in (around, to_edges, around[:1], 9.0 + around):
-        inside = ray.contains_points(points)
-        assert np.array_equal(inside, contains_points(ray, points)) and np.array_equal(inside[:1], ray.contains_points(points[:1]))
 
 
 def test_copies_and_pickles_answer_the_same() -> None:

@@ -14,7 +14,8 @@ from tests.device import NAME as DEVICE
 from tests.kernel_tools import cpu_only
 from tests.refused import refused
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.queries.arguments import rays_of
+from wrt.accel.queries.rays import rays_on
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.picture.film import Film
 from wrt.scene.shapes import box, icosphere
@@ -108,7 +109,7 @@ def test_rays_are_not_copied() -> None:
     accel = wrt.build(box())
     for origins, directions in ((ORIGINS, DIRECTIONS), (Tensor(ORIGINS), Tensor(DIRECTIONS)),
                                 (to_warp(ORIGINS, wp.vec3), to_warp(DIRECTIONS, wp.vec3))):
-        rays = rays_on(accel.device, rays_of(origins, directions, 0.0, np.inf))
+        rays = rays_on(accel.device, rays_of(origins, directions, 0.0, np.inf)[0])
         assert (address(rays.origin), address(rays.direction)) == (address(ORIGINS), address(DIRECTIONS))
 
 

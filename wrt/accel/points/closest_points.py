@@ -12,12 +12,10 @@ from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.points.contains import contains
 from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
-from wrt.accel.queries.hit_points import HitIds, Source, device_scene
-from wrt.accel.queries.part_faces import part_faces
+from wrt.accel.queries.arguments import check_world, in_shape, points_of, roots_at
+from wrt.accel.queries.hit_points import HitIds, Source, device_scene, part_faces
 from wrt.accel.queries.raw_launches import RowKernel
-from wrt.accel.queries.rays import to_origin
-from wrt.accel.queries.shapes import in_shape, shaped_points
-from wrt.accel.queries.world_ids import check_world, roots_at
+from wrt.accel.queries.rays import filled, to_origin
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
 from wrt.core.device import launch_on, made_once, upload
@@ -81,10 +79,8 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         A bvh4, bvh8 or bvh8c without spheres, or instances of such, with the watertight triangle test.
     points : (..., 3) array_like
         Query points, converted to float32.
-    threads : int, optional
-        Threads on the CPU; one per core by default.
-    world : int or (...) array_like of int, optional
-        Index of the world of each point; required over several worlds.
+    threads, world
+        See `Accelerator.closest_hit`, with points in place of rays.
 
     Returns
     -------
@@ -103,8 +99,8 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     origin = snapshot.geometry.origin
-    rows, shape, world = shaped_points(points, world, origin)
-    worlds = check_world(snapshot, world, len(rows))
+    rows, shape = points_of(points, origin)
+    worlds = check_world(snapshot, world, shape)
     roots = roots_at(snapshot, worlds, len(rows))
     kernel, surfaces = rows_kernel(kernels.layout, roots is not None), point_surfaces(snapshot)
     given = rows, np.zeros(len(rows), np.int32) if roots is None else roots
@@ -123,15 +119,11 @@ def rows_kernel(layout: NodeLayout, instances: bool) -> RowKernel:
 
 def _on_gpu(kernel: Kernel, snapshot: Snapshot, surfaces: WarpStruct, given: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
     """Run the kernel on a GPU as RowKernel.rows."""
-    device, rows = snapshot.device, PointRows()
-    kinds = {name: field.dtype for name, field in fields_of(PointRows).items()}
-    for (name, kind), values in zip(kinds.items(), given, strict=False):
-        setattr(rows, name, upload(values, kind, device))
-    out = {name: wp.empty(len(given[0]), dtype=kind, device=device) for name, kind in [*kinds.items()][len(given):]}
-    for name, array in out.items():
-        setattr(rows, name, array)
-    launch_on(device, kernel, len(given[0]), snapshot.data, surfaces, rows, 0)
-    return [array.numpy() for array in out.values()]
+    device, n, kinds = snapshot.device, len(given[0]), [field.dtype for field in fields_of(PointRows).values()]
+    out = [wp.empty(n, dtype=kind, device=device) for kind in kinds[len(given):]]
+    rows = filled(PointRows, [*(upload(values, kind, device) for values, kind in zip(given, kinds, strict=False)), *out])
+    launch_on(device, kernel, n, snapshot.data, surfaces, rows, 0)
+    return [array.numpy() for array in out]
 
 
 @once
@@ -178,11 +170,11 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
     origin = snapshot_of(accel, instances=True).geometry.origin
-    rows, shape, world = shaped_points(points, world, origin)  # NumPy arrays: queries return tensors for tensors
-    rows = to_origin(rows, origin)
+    rows, shape = points_of(points, origin)  # NumPy arrays: queries return tensors for tensors
+    rows = in_shape(to_origin(rows, origin), shape)
     if sign == "crossings":
         inside = contains(accel, rows, threads, world=world)
     else:
         inside = winding_number(accel, rows, threads, world=world) > 0.5
     distance = closest_points(accel, rows, threads, world=world).distance
-    return np.where(inside, -distance, distance).reshape(shape)
+    return np.where(inside, -distance, distance)

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.geometry import InstancedGeometry, inverse_of
-from wrt.accel.points.contains import open_edges_of
-from wrt.accel.points.enclosing import enclosing
-from wrt.accel.points.winding_tree import winding_tree
+from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.geometry import Geometry, InstancedGeometry, inverse_of
+from wrt.accel.points.contains import enclosing, finite_faces, open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.arguments import check_world, in_shape, points_of
 from wrt.accel.queries.hit_points import device_scene
-from wrt.accel.queries.shapes import in_shape, shaped_points
-from wrt.accel.queries.world_ids import check_world
-from wrt.accel.snapshot import Snapshot
+from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import given_like
-from wrt.core.device import launch_on, upload
+from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
 from wrt.kernels.query import FARTHEST
-from wrt.kernels.winding import wind, wind_by_tree
+from wrt.kernels.winding import WindingNode, expand_nodes, wind, wind_by_tree
 
 POINTS_PER_LAUNCH = 256
+LEAF = 8  # triangles in a leaf of the tree
+NODES_PER_LAUNCH = 256
 MAX_UNEVEN = 1e-5  # largest deviation of a matrix A from a multiple of a rotation, in A^T A
 
 
@@ -55,12 +55,10 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
         Structure over one mesh, instances or worlds, without spheres.
     points : (..., 3) array_like
         Points, converted to float32.
-    threads : int, optional
-        Threads on the CPU; one per core by default.
+    threads, world
+        See `Accelerator.closest_hit`, with points in place of rays. In a world that does not exist, the result is 0.
     exact : bool
         Sum all solid angles instead: the error is 1e-12, and a point takes 15 ns per triangle.
-    world : int or (...) array_like of int, optional
-        Index of the world of each point; required over several worlds. In a world that does not exist, the result is 0.
 
     Returns
     -------
@@ -79,8 +77,8 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     """
     accel, threads = enclosing(accel), thread_count(threads)
     snapshot = accel.snapshot
-    rows, shape, world = shaped_points(points, world, snapshot.geometry.origin)
-    worlds = check_world(snapshot, world, len(rows))
+    rows, shape = points_of(points, snapshot.geometry.origin)
+    worlds = check_world(snapshot, world, shape)
     if isinstance(snapshot.geometry, InstancedGeometry):
         out = np.zeros(len(rows))
         ids = np.zeros(len(rows), np.int32) if worlds is None else worlds.arrays.id.numpy()
@@ -126,3 +124,57 @@ def _local_points(geometry: InstancedGeometry, points: np.ndarray, world: np.nda
         for i in range(first[w], first[w + 1]):
             local = wide @ to_local[i, :, :3].T + to_local[i, :, 3]
             yield some, np.ascontiguousarray(np.clip(local, -FARTHEST, FARTHEST), np.float32), int(geometry.part[i])
+
+
+# --- the tree: each subtree has a multipole expansion of its solid angle (kernels/winding.py) ---------------------------------
+
+
+class WindingTree(NamedTuple):
+    """Tree on the structure's device.
+
+    nodes: WindingNode; node 0 is the root. faces: indices of faces, in the order of the leaves.
+    """
+
+    nodes: WarpArray
+    faces: WarpArray
+
+
+@once
+def winding_tree(snapshot: Snapshot, threads: int) -> WindingTree:
+    """Make the tree over the finite faces of a structure's mesh."""
+    mesh, device = snapshot.mesh, snapshot.device
+    used = finite_faces(mesh)
+    nodes, order = nodes_over(Geometry(mesh.vertices, mesh.faces[used], np.zeros((0, 4), np.float32)), threads)
+    begin, end = ranges_of(nodes)
+    tree = WindingTree(upload(nodes, WindingNode, device), upload(used[order], wp.int32, device))
+    launch_on(device, expand_nodes, len(nodes), device_scene(snapshot).surfaces, tree.faces, upload(begin, wp.int32, device),
+              upload(end, wp.int32, device), tree.nodes, None, threads=threads, step=NODES_PER_LAUNCH)
+    return tree
+
+
+def nodes_over(geometry: Geometry, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return WindingNode records without expansions, each before its children, and the triangles in the order of the leaves."""
+    n = len(geometry)
+    if n <= LEAF:
+        nodes = records(WindingNode, 1)
+        nodes["count"] = n
+        return nodes, np.arange(n)
+    tree = build_binary(geometry, BvhOptions("binned", max_leaf=LEAF), threads)
+    # Child `side` of inner node i is node 2 i + side + 1 here.
+    first, count = (np.stack([tree.nodes[f"{name}_{side}"] for side in "01"], axis=1).reshape(-1) for name in ("first", "count"))
+    nodes = records(WindingNode, len(first) + 1)
+    nodes["first"], nodes["count"] = np.append(1, np.where(count > 0, first, 2 * first + 1)), np.append(0, count)
+    return nodes, tree.order
+
+
+def ranges_of(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first triangle of each node's subtree, and the end of its triangles, (N,)."""
+    begin, count = nodes["first"].copy(), nodes["count"].copy()
+    waiting = np.flatnonzero(count == 0) if len(nodes) > 1 else np.zeros(0, np.int64)
+    while len(waiting):
+        child = nodes["first"][waiting]
+        ready = (count[child] > 0) & (count[child + 1] > 0)
+        some, child = waiting[ready], child[ready]
+        begin[some], count[some] = begin[child], count[child] + count[child + 1]
+        waiting = waiting[~ready]
+    return begin, begin + count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn, Self, TypedDict, Unpack, overload
+from typing import Any, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -12,50 +12,34 @@ import warp as wp
 
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry, InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Counters, Hits, answer_arrays, arrays_of
-from wrt.accel.queries.batches import Query, trace_query
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
+from wrt.accel.queries.arguments import Shape, check_world, in_shape, rays_of
+from wrt.accel.queries.batches import Query, tiled_width, trace_query
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.observed import counted
-from wrt.accel.queries.rays import are_rows, rays_of
-from wrt.accel.queries.shapes import Shape, flat_arrays, in_shape, shaped_rays, worlds_of_each
-from wrt.accel.queries.tiles import tiled_width
-from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import AccelStats, Snapshot, Structure, check_units
 from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
+from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpStruct
 from wrt.core.warp_private import recording_tape, refuse_capture
 from wrt.kernels.structs import Surfaces
 
-# Names of queries that are functions, not methods.
-FUNCTIONS = ("all_hits", "first_hits", "count_hits", "visible", "ray_query", "closest_points", "contains", "signed_distance",
-             "winding_number", "walk", "trace")
 
-
-class CostOptions(TypedDict, total=False):
-    """Options of `closest_hit` about costs."""
-
-    counters: bool
-    trace: bool
-
-
-class WorldOptions(TypedDict, total=False):
-    """Option of all queries over worlds."""
+class RayOptions(TypedDict, total=False):
+    """Options of `any_hit` by keyword."""
 
     world: ArrayLike | None
-
-
-class RayOptions(WorldOptions, total=False):
-    """Options of `any_hit` about rays."""
-
     invalid: str
 
 
-class HitOptions(CostOptions, RayOptions, total=False):
+class HitOptions(RayOptions, total=False):
     """Options of `closest_hit` by keyword."""
+
+    counters: bool
+    trace: bool
 
 
 class Accelerator:
@@ -88,17 +72,6 @@ class Accelerator:
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
         self._cache: dict[str, Any] = {}  # arrays that later refits reuse
-
-    if not TYPE_CHECKING:  # type checkers report unknown names themselves
-
-        def __getattr__(self, name: str) -> NoReturn:
-            if name in ("to", "cuda"):
-                raise AttributeError(f"{type(self).__name__} stays on its device: build it with wrt.build(..., device=...)")
-            if name in FUNCTIONS:
-                raise AttributeError(f"{name} is a function: wrt.{name}(accel, ...)")
-            if name == "move" and not hasattr(type(self), "move"):
-                raise AttributeError(f"{type(self).__name__} cannot move: build it with wrt.build(..., movable=True)")
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     def __copy__(self) -> Self:
         """Return a copy that shares all arrays. A refit of either does not change the other."""
@@ -136,9 +109,6 @@ class Accelerator:
         return self._snapshot.stats
 
     @overload
-    def closest_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, out: Hits[WarpArray] | None = ..., **options: Unpack[HitOptions]) -> Hits[WarpArray]: ...
-    @overload
     def closest_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                     threads: int | None = ..., *, out: Hits | None = ..., **options: Unpack[HitOptions]) -> Hits: ...
     @overload
@@ -146,7 +116,7 @@ class Accelerator:
                     threads: int | None = ..., *, out: Hits[TensorT] | None = ..., **options: Unpack[HitOptions]) -> Hits[TensorT]: ...
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                     threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
-                    invalid: str = "raise", **costs: Unpack[CostOptions]) -> Hits[Any]:
+                    invalid: str = "raise", counters: bool = False, trace: bool = False) -> Hits[Any]:
         """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
         With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
@@ -164,14 +134,14 @@ class Accelerator:
         threads : int, optional
             Threads on the CPU; one per core by default.
         out : Hits, optional
-            Hits of the rays' shape whose arrays receive the results. These must not overlap with the arrays of the rays.
+            Hits of the rays' shape whose arrays receive the results. No two arrays of results and rays may overlap.
         world : int or array_like of int of the rays' shape, optional
             Index of the world that each ray sees; required over several worlds. Warp arrays are not checked: in a world that does
             not exist, a ray misses.
         invalid : {"raise", "miss"}
             "miss": a ray with NaN, another value that is not valid, or direction 0 misses. This reads Warp arrays on the host.
-        **costs
-            `counters=True` counts the nodes and primitives that each ray visits (`hits.counters`); `trace=True` also records every fetch.
+        counters, trace : bool
+            Count the nodes and primitives that each ray visits (`hits.counters`); `trace` also records every fetch.
 
         Returns
         -------
@@ -186,17 +156,18 @@ class Accelerator:
         snapshot = self.snapshot  # read once, because a refit may replace it during the query
         query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else arrays_of(out), world, invalid)
-        counters = _traced(snapshot, query, **costs)
+        counts = None
+        if counters or trace:
+            counts = counted(snapshot, query, fetches_too=trace)
+        else:
+            trace_query(snapshot, query)
         t, u, v, prim_id = query.out
-        hits: Hits[Any] = Hits(t, u, v, prim_id, counters, (snapshot, query.rays, query.worlds))
+        hits: Hits[Any] = Hits(t, u, v, prim_id, counts, (snapshot, query.rays, query.worlds))
         if recording_tape() is not None:
             record(hits, t=hits.t, u=hits.u, v=hits.v)
         hits = hits if shape is None else hits.in_shape(shape)
         return hits if give is None else hits.each(give)
 
-    @overload
-    def any_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                threads: int | None = ..., *, out: WarpArray | None = ..., **options: Unpack[RayOptions]) -> WarpArray: ...
     @overload
     def any_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
@@ -210,22 +181,15 @@ class Accelerator:
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads
+        origins, directions, t_min, t_max, threads, world, invalid
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
-        **options
-            `world` and `invalid`: see `closest_hit`.
 
         Returns
         -------
         (...) bool
             Array of the rays' shape, of NumPy or of the library of `origins`.
-
-        Raises
-        ------
-        InputError
-            Names the argument and what was expected.
         """
         snapshot = self.snapshot
         query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), threads,
@@ -233,14 +197,6 @@ class Accelerator:
         trace_query(snapshot, query)
         found = query.out[0] if shape is None else in_shape(query.out[0], shape)
         return found if give is None else give(found)
-
-
-def _traced(snapshot: Snapshot, query: Query, counters: bool = False, trace: bool = False) -> Counters | None:
-    """Trace the rays, and return their counters if they are asked for."""
-    if counters or trace:
-        return counted(snapshot, query, fetches_too=trace)
-    trace_query(snapshot, query)
-    return None
 
 
 def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], threads: int | None,
@@ -253,17 +209,10 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
     """
     if threads is not None:
         threads = thread_count(threads)
-    origin, gradients = snapshot.geometry.origin, types is HIT_TYPES
-    if are_rows(rays[0], rays[1]) and invalid == "raise":
-        valid, shape, give = rays_of(*rays, gradients, origin), None, None
-    else:
-        valid, shape = shaped_rays(*rays, gradients, invalid, origin)
-        give = to_tensor_like(*rays[:2])
-        out, world = out and flat_arrays(out, shape, types), worlds_of_each(world, shape)
-    n = len(valid.origins)
-    arrays = answer_arrays(types, out, n, snapshot.device if valid.as_warp else None, give is not None)
-    return Query(valid, arrays, threads, check_world(snapshot, world, n), tiled_width(shape) if shape else 0), shape, give
-
+    valid, shape = rays_of(*rays, types is HIT_TYPES, snapshot.geometry.origin, invalid)
+    form, give, width = ((len(valid.origins),), None, 0) if shape is None else (shape, to_tensor_like(*rays[:2]), tiled_width(shape))
+    arrays = answer_arrays(types, out, form, snapshot.device if valid.as_warp else None, give is not None)
+    return Query(valid, arrays, threads, check_world(snapshot, world, form), width), shape, give
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar, Unpack, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.geometry import InstancedGeometry
-from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
+from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.hit_points import HitIds, Source, device_scene
-from wrt.accel.queries.lists import ALL, BATCH, BATCH_ON_GPU, HIT_KINDS, GpuLists, Mesh, begins, hit_arrays, host_lists, rows_of
-from wrt.accel.queries.part_faces import part_faces
-from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
-from wrt.accel.queries.shapes import Shape, shaped_rays, worlds_of_each
-from wrt.accel.queries.world_ids import WorldIds, check_world, roots_at
+from wrt.accel.queries.arguments import Shape, WorldIds, check_world, rays_of, roots_at
+from wrt.accel.queries.hit_points import HitIds, Source, device_scene, part_faces
+from wrt.accel.queries.lists import ALL, BATCH, BATCH_ON_GPU, HIT_KINDS, GpuLists, Mesh, begins, host_lists, rows_of
+from wrt.accel.queries.rays import Rays, arrays_on, filled, host_arrays
 from wrt.accel.snapshot import Snapshot
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
@@ -30,12 +28,6 @@ from wrt.core.warp_private import struct_record
 from wrt.kernels.query import HitArrays
 
 T = TypeVar("T")
-
-
-class ListOptions(WorldOptions, total=False):
-    """Options of `first_hits` by keyword."""
-
-    crossings: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,31 +87,27 @@ class ListQuery:
         self.snapshot = snapshot_of(accel, instances=True)
         self.threads, self.device = thread_count(threads), self.snapshot.device
         self.crossings = as_one(crossings, bool, "crossings")
-        vertices = faces = first_face = None
+        self.mesh: Mesh = None, None, None
         if self.snapshot.roots is not None:
-            vertices, faces, first_face = part_faces(self.snapshot)
+            self.mesh = (*(part_faces(self.snapshot)[:2] if crossings else (None, None)), part_faces(self.snapshot).first_face)
         elif crossings:
             surfaces = device_scene(self.snapshot).surfaces
-            vertices, faces = surfaces.vertices, surfaces.faces
-        self.mesh: Mesh = (vertices, faces, first_face) if crossings else (None, None, first_face)
+            self.mesh = surfaces.vertices, surfaces.faces, None
 
-    def of_valid(self, rays: Rays, world: ArrayLike | None = None) -> ListQuery:
-        """Set rays that are valid: contiguous NumPy arrays of float32. world: see `of`."""
-        self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
-        self.worlds = check_world(self.snapshot, world, self.n)
-        self.roots = roots_at(self.snapshot, self.worlds, self.n)
+    def of_valid(self, rays: Rays, worlds: WorldIds | None) -> ListQuery:
+        """Set rays that are valid: contiguous NumPy arrays of float32."""
+        self.n, self.rays, self.worlds = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays), worlds
+        self.roots = roots_at(self.snapshot, worlds, self.n)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
            world: ArrayLike | None = None) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
-        zero = self.snapshot.geometry.origin
-        if are_rows(origins, directions):
-            rays = rays_of(origins, directions, t_min, t_max, origin=zero)  # type: ignore[arg-type]
-        else:
-            rays, self.shape = shaped_rays(origins, directions, t_min, t_max, origin=zero)
-            world, self.give = worlds_of_each(world, self.shape), to_tensor_like(origins, directions) or to_numpy
-        return self.of_valid(host_arrays(rays) if self.device.is_cpu else rays, world)
+        rays, self.shape = rays_of(origins, directions, t_min, t_max, origin=self.snapshot.geometry.origin)
+        if self.shape is not None:
+            self.give = to_tensor_like(origins, directions) or to_numpy
+        worlds = check_world(self.snapshot, world, (len(rays.origins),) if self.shape is None else self.shape)
+        return self.of_valid(host_arrays(rays) if self.device.is_cpu else rays, worlds)
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
         """Find the first `limit` hits of each ray."""
@@ -154,7 +142,7 @@ class ListQuery:
             target = struct_record(HitArrays, hits)
         else:
             hits = [upload(array, kind, self.device) for array, kind in zip(hits, HIT_KINDS, strict=True)]
-            target = hit_arrays(hits)
+            target = filled(HitArrays, hits)
         self._each(k, lambda lists, begin, counts: lists.copy(np.arange(begin, begin + len(counts)) * k, target))
         shape = (self.n,) if self.shape is None else self.shape
         return Hits(*[*(self.give(array.reshape((*shape, k))) for array in hits), None, self._source(k)])
@@ -206,11 +194,11 @@ def stores_once(snapshot: Snapshot) -> bool:
 
 @overload
 def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **options: Unpack[WorldOptions]) -> AllHits: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *, world: ArrayLike | None = ...) -> AllHits: ...
 @overload
 def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
-             **options: Unpack[WorldOptions]) -> AllHits[TensorT]: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *,
+             world: ArrayLike | None = ...) -> AllHits[TensorT]: ...
 def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
              threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
@@ -233,11 +221,6 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
     -------
     AllHits
         Arrays of NumPy, or of the library of `origins`: PyTorch, JAX.
-
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected.
     """
     return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world).all()
 
@@ -245,10 +228,10 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
 @overload
 def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
-               **options: Unpack[WorldOptions]) -> npt.NDArray[np.int64]: ...
+               *, world: ArrayLike | None = ...) -> npt.NDArray[np.int64]: ...
 @overload
 def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
-               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **options: Unpack[WorldOptions]) -> TensorT: ...
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *, world: ArrayLike | None = ...) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
@@ -262,11 +245,6 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
     -------
     (...) int64
         Array of the rays' shape, of NumPy or of the library of `origins`: PyTorch, JAX.
-
-    Raises
-    ------
-    InputError
-        Names the argument and what was expected.
     """
     query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world)
     counts = query.counts()
@@ -275,11 +253,12 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
 
 @overload
 def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ...,
-               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., **options: Unpack[ListOptions]) -> Hits: ...
+               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., *, crossings: bool = ...,
+               world: ArrayLike | None = ...) -> Hits: ...
 @overload
 def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT | None = ...,
-               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ...,
-               **options: Unpack[ListOptions]) -> Hits[TensorT]: ...
+               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., *, crossings: bool = ...,
+               world: ArrayLike | None = ...) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, *, crossings: bool = False,
                world: ArrayLike | None = None) -> Hits[Any]:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from wrt.accel.queries.arguments import Shape, in_shape
 from wrt.accel.queries.hit_points import HitPoints, Source
-from wrt.accel.queries.shapes import in_shape
-from wrt.core.arrays import check_no_gradients, from_tensor, is_tensor, to_numpy, to_warp
+from wrt.core.arrays import check_no_gradients, from_tensor, given_like, is_tensor, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
@@ -48,14 +47,6 @@ class Counters:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
         return self.counts[name]
 
-    def of(self, rays: np.ndarray) -> Counters:
-        """Return the costs of some of the rays, given by their indices, in the shape of the indices."""
-        flat = rays.reshape(-1)
-        lengths, first = np.diff(self.first)[flat], np.zeros(len(flat) + 1, np.int64)
-        np.cumsum(lengths, out=first[1:])
-        fetches = np.arange(first[-1]) + np.repeat(self.first[:-1][flat] - first[:-1], lengths)
-        return Counters(self.counts.reshape(-1)[rays], first, self.address[fetches], self.size[fetches])
-
     def __repr__(self) -> str:
         means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
         return f"Counters({self.counts.size} rays; mean per ray: {means})" if self.counts.size else "Counters(0 rays)"
@@ -83,7 +74,7 @@ class Hits(HitPoints[ArrayT]):
         Index of the face, or number of faces plus index of the sphere; -1 on a miss. It counts on over all meshes of a scene: `face` is
         the index within the mesh of `object`.
     counters : Counters or None
-        Costs of each ray, if the query had `counters=True` or `trace=True`.
+        Costs of each ray, if the query had `counters=True` or `trace=True`; not in `hits[...]`.
     source : tuple or None
         Snapshot and rays from which points, normals and ids are computed. Pickled hits have none; those of `first_hits` have only ids.
     """
@@ -109,13 +100,12 @@ class Hits(HitPoints[ArrayT]):
         keys = tuple(to_numpy(key) if is_tensor(key) or isinstance(key, wp.array) else key
                      for key in (index if isinstance(index, tuple) else (index,)))
         rays = np.asarray(np.arange(int(np.prod(self.shape))).reshape(self.shape)[keys])
-        some: Hits[ArrayT] = self.each(lambda array: self._given(to_numpy(array).reshape(-1)[rays]))
+        some: Hits[ArrayT] = self.each(lambda array: given_like(self.prim_id, to_numpy(array).reshape(-1)[rays]))
         if self.source is None:
-            return replace(some, counters=self.counters and self.counters.of(rays))
+            return replace(some, counters=None)
         snapshot, own, worlds = self.source
         flat = rays.reshape(-1)
-        source = snapshot, own and own.of(flat), worlds and worlds.of(flat)
-        return replace(some, counters=self.counters and self.counters.of(rays), source=source)
+        return replace(some, counters=None, source=(snapshot, own and own.of(flat), worlds and worlds.of(flat)))
 
     def _repr_html_(self) -> str:
         hits = self.numpy()
@@ -126,20 +116,10 @@ class Hits(HitPoints[ArrayT]):
         return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
 
     def save(self, path: PathLike) -> None:
-        """Write a table with one row per element of `t`, in C order.
+        """Write a table, one row per element of `t` in C order, to `path`, a .csv or .parquet file.
 
         Its columns are index, t, u, v, prim_id; x, y and z of `point`, if the hits have a `source`; and `counters`, if any.
         Numbers keep their bits. On a miss, t is inf, prim_id -1, and x, y and z are NaN.
-
-        Parameters
-        ----------
-        path : str or path
-            A .csv or .parquet file.
-
-        Raises
-        ------
-        InputError
-            For another suffix, for Parquet without pyarrow, or if the file cannot be written.
         """
         hits = self.numpy()
         columns = {"index": np.arange(hits.t.size), "t": hits.t, "u": hits.u, "v": hits.v, "prim_id": hits.prim_id}
@@ -161,9 +141,6 @@ class Hits(HitPoints[ArrayT]):
         """Return the hits with t, u, v and prim_id passed through `convert`."""
         return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
 
-    def _flat(self) -> Hits[ArrayT]:
-        return self.in_shape((int(np.prod(self.shape)),))
-
     def in_shape(self, shape: tuple[int, ...]) -> Hits[ArrayT]:
         """Return the hits in another shape, in views of the same arrays. The number of hits stays the same."""
         costs = self.counters and replace(self.counters, counts=self.counters.counts.reshape(shape))
@@ -182,34 +159,29 @@ def arrays_of(out: object) -> list[Any]:
     return [out.t, out.u, out.v, out.prim_id]
 
 
-def answer_arrays(types: Mapping[str, np.dtype], out: Sequence[Any] | None, n: int, device: Device | None,
+def answer_arrays(types: Mapping[str, np.dtype], out: Sequence[Any] | None, shape: Shape, device: Device | None,
                   shared: bool = False) -> Sequence[Array]:
-    """Return one array (n,) per entry of `types`: checked arrays of `out`, or new ones. device: None for NumPy arrays, else Warp.
+    """Return one array (N,) per entry of `types`: arrays of `out`, which have the rays' shape, or new ones. device: None for NumPy.
 
     shared: begin a new array at a cache line, because JAX would copy any other array. Raises InputError that names the array by its
     key in `types`.
     """
+    n = shape[0] if len(shape) == 1 else int(np.prod(shape))
     if out is None:
         if device is not None:
             return [wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device) for dtype in types.values()]
         return [empty_aligned(n, dtype) if shared else np.empty(n, dtype) for dtype in types.values()]
-    if {*map(type, out)} != {np.ndarray}:
-        out = [from_tensor(array, name, None) for name, array in zip(types, out, strict=True)]
-    alone = device is None and len({*map(id, out)}) == len(out)  # whether no array can share memory with another
+    arrays = []
     for (name, dtype), array in zip(types.items(), out, strict=True):
+        if type(array) is not np.ndarray:
+            array = from_tensor(array, name, None)
         if device is None:
-            fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
-            alone = alone and fits and array.base is None
+            fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray and array.shape == shape
         else:
             fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
-                    and (array.is_contiguous or n == 0))
-        if not (fits and array.shape == (n,)):
+                    and (array.is_contiguous or n == 0) and array.shape == (shape or (1,)))
+        if not fits:
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device} and")
-            raise InputError(f"must be a {kind} array ({n},) of {dtype}, {place} contiguous, got {shown(array)}", argument=name)
-    if alone:
-        return out
-    # The arrays are contiguous, so that they overlap exactly if their bounds do.
-    for (name, one), (other, two) in combinations(zip(types, out, strict=True), 2) if len(out) > 1 else ():
-        if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
-            raise InputError(f"shares memory with {other}", argument=name)
-    return out
+            raise InputError(f"must be a {kind} array {shape} of {dtype}, {place} contiguous, got {shown(array)}", argument=name)
+        arrays.append(array if array.ndim == 1 else in_shape(array, (n,)) if device is not None else array.reshape(-1))
+    return arrays

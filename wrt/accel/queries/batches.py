@@ -8,10 +8,9 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.arguments import WorldIds
 from wrt.accel.queries.raw_launches import SMALL, FewRows, RowKernel, raw_launch
-from wrt.accel.queries.rays import Rays, constant, rays_on
-from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
-from wrt.accel.queries.world_ids import WorldIds
+from wrt.accel.queries.rays import Rays, constant, filled, rays_on
 from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
@@ -32,14 +31,15 @@ MOST_ON_GPU = 1 << 26  # Largest number of rays that are copied to a GPU at once
 BYTES_OF_RAY = 48  # A ray and its hit.
 FITS_ANY_GPU = 1 << 20  # Up to this number of rays, the free memory of the GPU is not queried.
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range.
+SIDE = 4  # pixels of a square of 16 rays, which are a packet (kernels.wide.layout.LANES) and share more nodes than 16 pixels of a row
+LARGEST = 256  # rows and columns: the rays of larger pictures are so dense that the copies cost more than tiles save
 BUFFERED = 16384  # Rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache.
 
 
 class Query(NamedTuple):
     """A call of closest_hit or any_hit.
 
-    out: arrays for the results: t, u, v and prim_id, or one array of bool. threads: None for one per core. width: see
-    tiles.tiled_width.
+    out: arrays for the results: t, u, v and prim_id, or one array of bool. threads: None for one per core. width: `tiled_width`.
     """
 
     rays: Rays
@@ -84,15 +84,10 @@ def trace_made(snapshot: Snapshot, made: MadeRays, any_hit: bool, threads: int) 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
     """Trace the rays and write the results to query.out. Raises InputError for invalid rays, after some results are written."""
     any_hit = len(query.out) == 1
-    if query.worlds is None:
-        if snapshot.device.is_cuda:
-            trace_on_gpu(snapshot, query)
-        else:
-            tracer(snapshot.structure, any_hit).trace(snapshot, query)
-    elif snapshot.device.is_cuda or not has_stream(snapshot.structure):
-        trace_worlds(snapshot, query, query.worlds)
+    if snapshot.device.is_cuda or (query.worlds is not None and not has_stream(snapshot.structure)):
+        trace_one_by_one(snapshot, query)
     else:
-        world_tracer(snapshot.structure, any_hit).trace(snapshot, query)
+        (tracer if query.worlds is None else world_tracer)(snapshot.structure, any_hit).trace(snapshot, query)
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
@@ -282,33 +277,48 @@ def rays_on_gpu(n: int, device: Device) -> int:
     return MOST_ON_GPU if n <= FITS_ANY_GPU else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
 
 
-def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
-    """Trace on a GPU, as trace_query does: rays in Warp arrays in one launch, rays in NumPy arrays in parts."""
-    device, rays, out = snapshot.device, query.rays, query.out
-    kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(snapshot.structure)
+def trace_one_by_one(snapshot: Snapshot, query: Query) -> None:
+    """Trace as trace_query does, a ray per thread: on a GPU, rays in NumPy arrays in parts; each ray in its own world in one launch."""
+    device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
+    if query.worlds is not None:
+        kernel, more = worlds_kernel(structure, len(out) == 1), [query.worlds.arrays]
+    else:
+        kernel, more = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure), []
     n = len(out[0])
-    part = n if rays.as_warp else rays_on_gpu(n, device)
+    part = n if rays.as_warp or more else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
         rays_of_part, out_of_part = (rays, out) if part >= n else (Rays(*(array[some] for array in rays)), [array[some] for array in out])
-        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, rays_on(device, rays_of_part)], out_of_part)
+        inputs = [snapshot.data, snapshot.surfaces, rays_on(device, rays_of_part), *more]
+        launch_over(device, kernel, inputs, out_of_part, thread_count(query.threads))
 
 
-def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
-    """Trace each ray in its own world, as trace_query does; on a GPU in one launch."""
-    device = snapshot.device
-    inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
-    launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, thread_count(query.threads))
-
-
-def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: Sequence[Array], threads: int = 1) -> None:
+def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: Sequence[Array], threads: int) -> None:
     """Launch a kernel that traces one ray per thread over all rays, and write the results to `out`."""
     on_device = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
                  else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
-    hits: WarpStruct = HitArrays()
-    for name, array in zip(fields_of(HitArrays), on_device, strict=False) if len(out) > 1 else ():
-        setattr(hits, name, array)
-    launch_on(device, kernel, len(out[0]), *inputs, hits if len(out) > 1 else on_device[0], None, threads=threads, step=RAYS_PER_LAUNCH)
+    hits = filled(HitArrays, on_device) if len(out) > 1 else on_device[0]
+    launch_on(device, kernel, len(out[0]), *inputs, hits, None, threads=threads, step=RAYS_PER_LAUNCH)
     for array, result in zip(out, on_device, strict=True):
         if not isinstance(array, wp.array) and device.is_cuda:
             array[:] = result.numpy()
+
+
+def tiled_width(shape: tuple[int, ...]) -> int:
+    """Return the width of small pictures of rays, (..., rows, columns), that consist of whole tiles. Return 0 for all other shapes."""
+    return shape[-1] if len(shape) > 1 and all(n % SIDE == 0 and n <= LARGEST for n in shape[-2:]) else 0
+
+
+def copy_to_tiles(tiles: np.ndarray, rows: np.ndarray, width: int) -> None:
+    """Copy contiguous pixels from rows of pictures to tiles: both (N, ...) of one dtype, and N a multiple of SIDE * width."""
+    _pieces(tiles, -1, width // SIDE, SIDE)[...] = _pieces(rows, -1, SIDE, width // SIDE).swapaxes(1, 2)
+
+
+def copy_from_tiles(rows: np.ndarray, tiles: np.ndarray, width: int) -> None:
+    """Copy pixels from tiles back to rows of pictures. Arguments: see `copy_to_tiles`."""
+    _pieces(rows, -1, SIDE, width // SIDE)[...] = _pieces(tiles, -1, width // SIDE, SIDE).swapaxes(1, 2)
+
+
+def _pieces(pixels: np.ndarray, *shape: int) -> np.ndarray:
+    """View pixels (N, ...) as pieces of SIDE pixels, which NumPy copies as one item each."""
+    return pixels.reshape(-1).view(f"V{SIDE * pixels[:1].nbytes}").reshape(shape)

@@ -10,17 +10,16 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, run_of
-from wrt.accel.geometry import Geometry, InstancedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
+from wrt.accel.queries.arguments import WorldIds, in_shape, over_worlds
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import rays_on, to_origin
-from wrt.accel.queries.shapes import in_shape
-from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import from_tensor, given_like, to_numpy, to_tensor_like, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike, ArrayT, WarpStruct
+from wrt.core.types import ArrayLike, ArrayT, WarpArray, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays, RayArrays
@@ -37,6 +36,14 @@ class DeviceScene(NamedTuple):
     scene: FlatScene
     surfaces: WarpStruct
     object_ids: WarpStruct
+
+
+class PartFaces(NamedTuple):
+    """Triangles of all parts of an InstancedGeometry, on the structure's device."""
+
+    vertices: WarpArray  # In the parts' own spaces.
+    faces: WarpArray  # Of each part in the order of its prim_ids, with gaps where the part lacks prim_ids.
+    first_face: WarpArray  # (P,) int32, index in `faces` of the face with prim_id 0 of each part.
 
 
 class HitIds(Generic[ArrayT]):
@@ -84,15 +91,6 @@ class HitIds(Generic[ArrayT]):
                              " alone, copies and pickled hits lose all", hint="ask the result of closest_hit before it is copied")
         return self.source
 
-    def _flat(self) -> Any:
-        """Return the hits (N,)."""
-        return self
-
-    def _given(self, values: np.ndarray) -> ArrayT:
-        """Return NumPy values as an array of the hits' library."""
-        given: ArrayT = given_like(self.prim_id, values)
-        return given
-
     def _filled(self, name: str) -> ArrayT:
         from wrt.kernels.shade.hit_points import HitPlaces, hit_places  # not at the top: pictures do not need it
 
@@ -126,7 +124,8 @@ class HitIds(Generic[ArrayT]):
             array = upload(array.numpy() + np.float32(np.spacing(2.0 * np.abs(origin).max())), array.dtype, device)
         if isinstance(self.prim_id, wp.array):
             if name == "point":
-                record(self._flat(), point=array)
+                own: Any = self
+                record(own.in_shape((n,)), point=array)
                 array = to_origin(array, origin)
             return in_shape(array, shape)
         give: Any = to_tensor_like(self.prim_id)
@@ -139,8 +138,9 @@ class HitIds(Generic[ArrayT]):
 class HitPoints(HitIds[ArrayT]):
     """Properties of hits that `closest_hit` found, as arrays of the same library and leading shape (...) as the hits.
 
-    Each access computes the property again from the arrays of hits and rays. These arrays are not copied: do not modify them.
-    A property raises InputError if the hits have no `source`, or the structure lacks the data for the property.
+    Points and normals are (..., 3) float32 in world space; on a miss, all numbers are NaN. Each access computes the property again from
+    the arrays of hits and rays. These arrays are not copied: do not modify them. A property raises InputError if the hits have no
+    `source`, or the structure lacks the data for the property.
     """
 
     t: ArrayT
@@ -150,7 +150,8 @@ class HitPoints(HitIds[ArrayT]):
     @property
     def hit(self) -> ArrayT:
         """Whether each ray hits something: (...) bool."""
-        return self._given(to_numpy(self.prim_id) >= 0)
+        hit: ArrayT = given_like(self.prim_id, to_numpy(self.prim_id) >= 0)
+        return hit
 
     @property
     def distance(self) -> ArrayT:
@@ -159,7 +160,9 @@ class HitPoints(HitIds[ArrayT]):
         check_recorded(self, "distance")
         length = np.linalg.norm(to_numpy(rays.directions).astype(np.float64), axis=1).reshape(self.shape)
         t = to_numpy(self.t)
-        return self._given(np.multiply(t, length, out=np.full(t.shape, np.inf), where=np.isfinite(t)).astype(np.float32))
+        far = np.multiply(t, length, out=np.full(t.shape, np.inf), where=np.isfinite(t)).astype(np.float32)
+        distance: ArrayT = given_like(self.prim_id, far)
+        return distance
 
     @property
     def points(self) -> ArrayT:
@@ -173,9 +176,7 @@ class HitPoints(HitIds[ArrayT]):
 
     @property
     def point(self) -> ArrayT:
-        """Point where each ray meets its primitive, in world space, to within `point_error`: (..., 3) float32, NaN on a miss.
-
-        It is float64 (Warp: vec3d) if the structure is far from 0 (`Accelerator.origin`).
+        """Point where each ray meets its primitive, to within `point_error`; float64 (vec3d) far from 0 (`Accelerator.origin`).
 
         It is computed from the ray in float64 and rounded once, because u and v are inaccurate on needle-shaped triangles. If the
         exact ray misses the triangle by a rounding error, the point is moved onto the triangle, and `point_error` includes the
@@ -185,28 +186,22 @@ class HitPoints(HitIds[ArrayT]):
 
     @property
     def point_error(self) -> ArrayT:
-        """Error bound of each coordinate of `point`, usually half a float32 rounding step: (..., 3) float32, NaN on a miss."""
+        """Error bound of each coordinate of `point`, usually half a float32 rounding step."""
         return self._filled("error")
 
     @property
     def normal(self) -> ArrayT:
-        """Unit geometric normal, on a triangle's counter-clockwise side or outwards of a sphere: (..., 3) float32, NaN on a miss."""
+        """Unit geometric normal, on a triangle's counter-clockwise side or outwards of a sphere."""
         return self._filled("normal")
 
     @property
     def shading_normal(self) -> ArrayT:
-        """Unit normal interpolated from vertex normals, on the side of `normal`: (..., 3) float32, NaN on a miss.
-
-        Without vertex normals it equals `normal`. A refit does not change the vertex normals.
-        """
+        """Unit normal interpolated from vertex normals, which no refit changes, on the side of `normal`; `normal` without these."""
         return self._filled("shading")
 
     @property
     def uv(self) -> ArrayT:
-        """Interpolated texture coordinates, with (0, 0) at the top left of the texture: (..., 2) float32, NaN on a miss.
-
-        In a scene they are (0, 0) on objects without texture coordinates.
-        """
+        """Interpolated texture coordinates, (..., 2) float32; (0, 0) is the texture's top left, and stands for objects without uvs."""
         return self._filled("uv")
 
     def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
@@ -225,12 +220,7 @@ class HitPoints(HitIds[ArrayT]):
         Returns
         -------
         Gradients
-            Arrays of float64.
-
-        Raises
-        ------
-        InputError
-            For other shapes, and unless the structure is over one mesh without spheres.
+            Arrays of float64. Only a structure over one mesh without spheres has gradients.
         """
         snapshot, rays, _ = self._source()
         snapshot.structure.require_one_mesh(ONE_MESH)
@@ -312,4 +302,26 @@ def instance_records(placed: Placed) -> np.ndarray:
     for i, axis in enumerate("xyz"):
         out[f"world_{axis}"], out[f"normal_{axis}"] = placed.to_world[:, i], inverse[:, i]
     out["handedness"] = np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
+    return out
+
+
+@once
+def part_faces(snapshot: Snapshot) -> PartFaces:
+    """Upload the faces of all parts of a structure over instances."""
+    geometry, device = snapshot.geometry, snapshot.device
+    assert isinstance(geometry, InstancedGeometry)
+    faces = [_by_prim_id(part) for part in geometry.parts]
+    first_vertex, first_face = (np.cumsum([0, *map(len, rows)]) for rows in ([part.vertices for part in geometry.parts], faces))
+    joined = [rows + np.int32(first) for rows, first in zip(faces, first_vertex, strict=False)]
+    return PartFaces(upload(np.concatenate([part.vertices for part in geometry.parts]), wp.vec3, device),
+                     upload(np.concatenate(joined), wp.vec3i, device), upload(first_face[:-1], wp.int32, device))
+
+
+def _by_prim_id(part: Geometry) -> np.ndarray:
+    """Return the faces of a part, row i with prim_id i; (0, 0, 0) where the part has no such prim_id."""
+    if not isinstance(part, NumberedGeometry):
+        return part.faces
+    prim_ids = part.prim_ids[: len(part.faces)]
+    out = np.zeros((int(prim_ids.max(initial=-1)) + 1, 3), np.int32)
+    out[prim_ids] = part.faces
     return out

@@ -8,6 +8,7 @@ import warp as wp
 
 from wrt.accel.queries.batches import Tracer, Worker, tracer
 from wrt.accel.queries.raw_launches import raw_launch
+from wrt.accel.queries.rays import filled
 from wrt.accel.snapshot import Snapshot, Structure
 from wrt.core.device import MOST_ROWS, launch_on, made_once, row_type, upload
 from wrt.core.errors import InputError
@@ -17,7 +18,6 @@ from wrt.core.warp_private import RawLaunch, array_record, record_of, struct_rec
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
-from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
 BATCH = 4096  # rays of a batch on the CPU, whose lists stay in a core's cache
@@ -173,9 +173,7 @@ class GpuLists:
     def find(self, snapshot: Snapshot, rays: Sequence[WarpArray], roots: np.ndarray | None, limit: int, mesh: Mesh,
              counting: bool) -> np.ndarray:
         n, room = len(rays[0]), 1 if counting else FEW
-        self.rays: WarpStruct = RayArrays()
-        for name, array in zip(fields_of(RayArrays), rays, strict=True):
-            setattr(self.rays, name, array)
+        self.rays = filled(RayArrays, rays)
         self.lists = [self._filled(snapshot, roots, room * np.arange(n + 1), limit, mesh, counting)]
         counts: np.ndarray = self.lists[0].count.numpy()
         if counting or counts.max() <= FEW:
@@ -209,16 +207,8 @@ class GpuLists:
     def hits(self, counts: np.ndarray) -> list[WarpArray]:
         first = begins(counts)
         out = [wp.empty(rows_of(first[-1]), dtype=kind, device=self.device) for kind in HIT_KINDS]
-        self.copy(first[:-1], hit_arrays(out))
+        self.copy(first[:-1], filled(HitArrays, out))
         return out
 
     def release(self) -> None:
         self.lists = []
-
-
-def hit_arrays(arrays: Sequence[WarpArray]) -> WarpStruct:
-    """Return Warp arrays t, u, v and prim_id as one kernel argument."""
-    out: WarpStruct = HitArrays()
-    for name, array in zip(fields_of(HitArrays), arrays, strict=True):
-        setattr(out, name, array)
-    return out

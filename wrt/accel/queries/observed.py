@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import HIT_TYPES, Counters, answer_arrays
+from wrt.accel.queries.arguments import rays_of
 from wrt.accel.queries.batches import Query, trace_query
-from wrt.accel.queries.rays import rays_of
 from wrt.accel.snapshot import Snapshot
 from wrt.core.checks import shown
 from wrt.core.device import on_host, upload
@@ -107,8 +107,8 @@ def record_steps(accel: object, origins: ArrayLike, directions: ArrayLike, t_min
     if snapshot.structure.units.instances:
         raise InputError("must be a structure over one mesh, not over instances", argument="accel",
                          hint="wrt.build(mesh) over one of the meshes, or wrt.build(wrt.Scene.of(meshes)) over all")
-    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True, snapshot.geometry.origin)
-    out = answer_arrays(HIT_TYPES, None, len(rays.origins), None, False)
+    rays, _ = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True, snapshot.geometry.origin)
+    out = answer_arrays(HIT_TYPES, None, (len(rays.origins),), None)
     query, first = Query(rays, out, thread_count(None)), np.zeros(len(rays.origins) + 1, np.int64)
     np.cumsum(on_host(observed(snapshot, query, "log", np.zeros(len(rays.origins), np.int64)).first), out=first[1:])
     recorder = observed(snapshot, query, "log", first[:-1].copy(), steps=int(first[-1]))

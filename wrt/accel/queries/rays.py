@@ -1,5 +1,6 @@
-"""Rays of a query: checks of the caller's arrays, and their conversion for kernels."""
+"""Rays of a query: checks of their values, and their conversion for kernels."""
 
+from collections.abc import Iterable
 from ctypes import c_float
 from functools import cache, lru_cache
 from math import copysign
@@ -8,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers
+from wrt.core.arrays import check_no_gradients, float32, real_numbers
 from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
-from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpType
-from wrt.core.warp_private import keep, recording_tape
+from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpStruct, WarpType
+from wrt.core.warp_private import keep
 from wrt.kernels.query import FARTHEST, RayArrays, add_origin, subtract_origin
 from wrt.kernels.warp_private import fields_of
 
@@ -83,39 +84,6 @@ def _converted(kernel: Kernel, points: WarpArray, origin: np.ndarray | None, kin
     return out
 
 
-def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False,
-            origin: np.ndarray | None = None) -> Rays:
-    """Check shapes and types of a query's arguments. gradients: origins and directions may require gradients.
-
-    origin: of the structure's geometry; the rays are relative to it. Raises InputError that names the argument.
-    """
-    if recording_tape() is not None:
-        without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
-        check_no_gradients(t_min=t_min, t_max=t_max, **without)
-    o: Any = origins if type(origins) is np.ndarray else from_tensor(origins, "origins")
-    d: Any = directions if type(directions) is np.ndarray else from_tensor(directions, "directions")
-    if isinstance(o, wp.array) or isinstance(d, wp.array):
-        if isinstance(o, wp.array) and o.dtype in (wp.vec3, wp.vec3d):
-            o = from_origin(o, origin)
-        if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (o, d)):
-            raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
-    else:
-        o, d = _rows(o, "origins", "(..., 3)"), _rows(d, "directions", "(..., 3)")
-        o = o if origin is None else o - origin
-    n = len(o)
-    if len(d) != n:
-        raise InputError(f"must have as many rows as origins ({n}), got {len(d)}", argument="directions")
-    return Rays(o, d, segment_ends(t_min, n, "t_min"), segment_ends(t_max, n, "t_max"))
-
-
-def are_rows(origins: object, directions: object) -> bool:
-    """Return whether `rays_of` takes both arguments as they are: NumPy arrays of one shape (N, ...), or Warp arrays (N,) of vec3."""
-    if type(origins) is np.ndarray and type(directions) is np.ndarray:
-        return origins.ndim == 2 and origins.shape == directions.shape
-    return (isinstance(origins, wp.array) and isinstance(directions, wp.array) and origins.dtype == directions.dtype == wp.vec3
-            and origins.ndim == 1 and origins.shape == directions.shape)
-
-
 def is_valid(origins: np.ndarray, directions: np.ndarray, t_min: np.ndarray, t_max: np.ndarray) -> np.ndarray:
     """Return whether each of some rays is valid, (N,) bool."""
     origins, directions = float32(origins), float32(directions)
@@ -123,12 +91,9 @@ def is_valid(origins: np.ndarray, directions: np.ndarray, t_min: np.ndarray, t_m
     return near & finite & directions.any(axis=1) & (t_min >= LOWEST["t_min"]) & (t_max >= LOWEST["t_max"])
 
 
-def rays_on(device: Device, rays: Rays) -> RayArrays:
+def rays_on(device: Device, rays: Rays) -> WarpStruct:
     """Check the rays and return them as Warp arrays on a device."""
-    out = RayArrays()
-    for name, array in zip(fields_of(RayArrays), arrays_on(device, rays), strict=True):
-        setattr(out, name, array)
-    return out
+    return filled(RayArrays, arrays_on(device, rays))
 
 
 def arrays_on(device: Device, rays: Rays) -> Rays:
@@ -140,6 +105,14 @@ def arrays_on(device: Device, rays: Rays) -> Rays:
             array = constant_array(float(array[0]), len(array), device) if one else upload(array, dtype, device)
         out.append(array)
     return Rays(*out)
+
+
+def filled(kind: WarpType, arrays: Iterable[Array | None]) -> WarpStruct:
+    """Return a Warp struct whose first fields are these arrays."""
+    out: WarpStruct = kind()
+    for name, array in zip(fields_of(kind), arrays, strict=False):
+        setattr(out, name, array)
+    return out
 
 
 def host_arrays(rays: Rays) -> Rays:
@@ -164,25 +137,6 @@ def default_end(value: float, device: str) -> WarpArray:
     return out
 
 
-def segment_ends(value: ArrayLike, n: int, name: str) -> Array:
-    """Convert t_min or t_max (`name`) of n rays to an array (n,). Raises InputError for other shapes, and for an invalid number."""
-    if type(value) is not float:  # a float, the usual case, needs no conversion
-        value = from_tensor(value, name, wp.float32)
-        if isinstance(value, wp.array):
-            if value.dtype != wp.float32 or value.shape != (n,):
-                raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)
-            return value
-        array = real_numbers(value, name, f"a number or ({n},)")
-        if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
-            raise InputError(f"must be a number or ({n},), got {array.shape}", argument=name)
-        if array.ndim == 1:
-            return array
-        value = float(float32(array))
-    if not value >= LOWEST[name]:
-        _check_ends(c_float(value).value, name)  # float32 rounds tiny negative numbers to 0
-    return constant(value, n)
-
-
 def constant(value: float, n: int) -> np.ndarray:
     """Return an array (n,) float32 of stride 0, all of whose elements are `value`. Values beyond float32 become infinite."""
     return _endless(value, copysign(1.0, value))[:n]
@@ -202,26 +156,22 @@ def _checked_ends(array: Array, name: str) -> Array:
     elif array.strides != (0,):
         array = float32(array)
     numbers = np.asarray(array)
-    _check_ends((numbers[:1] if numbers.strides == (0,) else numbers).min(initial=np.inf), name)
+    check_ends((numbers[:1] if numbers.strides == (0,) else numbers).min(initial=np.inf), name)
     return array
 
 
-def _check_ends(least: float, name: str) -> None:
+def check_ends(least: float, name: str) -> None:
     """Raise InputError for an invalid t_min or t_max (`name`). least: its least value, or NaN if any of its values is NaN."""
     if not least >= LOWEST[name]:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
 
-def _rows(value: Any, name: str, form: str = "(N, 3)") -> np.ndarray:
-    array: np.ndarray = value if type(value) is np.ndarray and value.dtype.kind == "f" else real_numbers(value, name, form)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"must be {form}, got {array.shape}", argument=name)
-    return array
-
-
 def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32).max), hint: str | None = None) -> np.ndarray:
     """Convert to (N, 3) float32. Raises InputError for other shapes, and for components that are NaN or beyond +-`most`."""
-    array = float32(_rows(value, name))
+    array = value if type(value) is np.ndarray and value.dtype.kind == "f" else real_numbers(value, name, "(N, 3)")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"must be (N, 3), got {array.shape}", argument=name)
+    array = float32(array)
     numbers = array.reshape(-1)
     if not (numbers.min(initial=0.0) >= -most and numbers.max(initial=0.0) <= most):  # False for NaN
         for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, Unpack, overload
+from typing import Any, overload
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -11,20 +11,19 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.geometry import Geometry, InstancedGeometry
-from wrt.accel.queries.accelerator import Accelerator, WorldOptions
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
+from wrt.accel.queries.arguments import check_world, in_shape, indices_of, pairs_of
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.hit_points import device_scene
-from wrt.accel.queries.rays import Rays, from_origin, to_origin, vectors
-from wrt.accel.queries.shapes import flat_array, in_shape, shaped_pairs, worlds_of_each
-from wrt.accel.queries.world_ids import check_world
-from wrt.core.arrays import check_no_gradients, real_numbers, to_numpy, to_tensor_like
+from wrt.accel.queries.rays import Rays, filled, from_origin, to_origin, vectors
+from wrt.core.arrays import check_no_gradients, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import Array, ArrayLike, Device, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
+from wrt.core.types import Array, ArrayLike, Device, Kernel, NumpyLike, TensorT, WarpArray
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.shade.segments import Pairs, segments, to_visible
 from wrt.kernels.structs import Surfaces
@@ -34,15 +33,12 @@ _cached_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDicti
 
 
 @overload
-def visible(accel: Accelerator, a: WarpArray, b: WarpArray, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: WarpArray | None = ..., **options: Unpack[WorldOptions]) -> WarpArray: ...
-@overload
 def visible(accel: Accelerator, a: NumpyLike, b: NumpyLike, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
             threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
-            **options: Unpack[WorldOptions]) -> npt.NDArray[np.bool_]: ...
+            world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
 @overload
 def visible(accel: Accelerator, a: TensorT, b: TensorT, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: TensorT | None = ..., **options: Unpack[WorldOptions]) -> TensorT: ...
+            threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
 def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | None = None, on_b: ArrayLike | None = None,
             threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
     """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
@@ -64,12 +60,8 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1; they broadcast, too. The point is moved off that
         triangle or sphere by its rounding error, as for shadow rays. In a structure without spheres, that triangle cannot block. Not for
         instances.
-    threads : int, optional
-        Threads on the CPU; one per core by default.
-    out : (...) bool, optional
-        Array that receives the results.
-    world : int or (...) array_like of int, optional
-        Index of the world of each pair; required over several worlds.
+    threads, out, world
+        See `Accelerator.any_hit`, with pairs in place of rays.
 
     Returns
     -------
@@ -86,38 +78,33 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     accel = copy(accel)  # a refit by another thread does not change the copy
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
-    flat, shape = shaped_pairs(a, b)
-    p, q = (_points(value, name, device, accel.snapshot.geometry.origin) for value, name in zip(flat, "ab", strict=True))
-    n, as_warp, give = len(p), isinstance(flat[0], wp.array), to_tensor_like(a, b)
-    given = None if out is None else [flat_array(out, shape, "out")]
-    array: Any = answer_arrays(ANY_HIT_TYPES, given, n, device if as_warp else None, give is not None)[0]
-    world = worlds_of_each(world, shape)
     snapshot, has_ids, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
-    worlds = check_world(snapshot, world, n)
+    flat, shape = pairs_of(a, b)
+    p, q = (_points(value, name, device, snapshot.geometry.origin) for value, name in zip(flat, "ab", strict=True))
+    n, as_warp, give = len(p), isinstance(flat[0], wp.array), to_tensor_like(a, b)
+    array: Any = answer_arrays(ANY_HIT_TYPES, out if out is None else [out], shape, device if as_warp else None, give is not None)[0]
+    worlds = check_world(snapshot, world, shape)
+    ids = [np.zeros(0, np.int32)] * 2
     if has_ids:
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
         surfaces = device_scene(snapshot).surfaces
-    ids = [_prim_ids(value, name, shape, len(snapshot.geometry)) if has_ids else np.zeros(0, np.int32)
-           for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
+        ids = [to_numpy(indices_of(-1 if value is None else value, shape, name, -1, len(snapshot.geometry)))
+               for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Kernel, *inputs: object) -> None:
         launch_on(device, kernel, n, *inputs, None, threads=threads, step=PAIRS_PER_LAUNCH)
 
-    rays: WarpStruct = RayArrays()
-    rays.origin, rays.direction = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(2))
-    rays.t_min, rays.t_max = (wp.empty(n, dtype=wp.float32, device=device) for _ in range(2))
+    rays = Rays(*(wp.empty(n, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, wp.float32, wp.float32)))
     size = np.inf if snapshot.changes else largest_size(snapshot.geometry)
-    pairs: WarpStruct = Pairs()
-    pairs.a, pairs.b, pairs.on_a, pairs.on_b = p, q, *(upload(each, wp.int32, device) for each in ids)
-    run(segments, surfaces, pairs, size, rays)
-    arrays = rays.origin, rays.direction, rays.t_min, rays.t_max
+    pairs = filled(Pairs, (p, q, *(upload(each, wp.int32, device) for each in ids)))
+    run(segments, surfaces, pairs, size, filled(RayArrays, rays))
     seen = wp.empty(n, dtype=wp.bool, device=device)
-    trace_query(snapshot, Query(Rays(*arrays), [seen], threads, worlds))
+    trace_query(snapshot, Query(rays, [seen], threads, worlds))
     run(to_visible, p, q, seen)
     result = np.array(to_numpy(seen)) if has_ids else seen
     if has_ids and not accel.structure.units.spheres:
-        _ignore_own_triangles(accel, arrays, ids, result, threads)
+        _ignore_own_triangles(accel, rays, ids, result, threads)
     if as_warp:
         array.assign(result)
     else:
@@ -150,10 +137,9 @@ def _extents(geometry: Geometry) -> tuple[float, float]:
     return _cached_extents[geometry]
 
 
-def _ignore_own_triangles(accel: Accelerator, rays: tuple[WarpArray, ...], ids: list[np.ndarray], seen: np.ndarray,
-                          threads: int) -> None:
+def _ignore_own_triangles(accel: Accelerator, rays: Rays, ids: list[np.ndarray], seen: np.ndarray, threads: int) -> None:
     """Set `seen` to True for pairs that only the triangles under the two points hide. ids: prim_ids of these triangles."""
-    origin, way, t_min, t_max = (each.numpy() for each in rays)
+    origin, way, t_min, t_max = map(to_numpy, rays)
     origin = to_origin(origin, accel.snapshot.geometry.origin)
     rows = np.nonzero(~seen & (t_max > 0.0))[0]
     prim_id = first_hits(accel, 3, origin[rows], way[rows], t_min[rows], t_max[rows], threads).prim_id
@@ -168,20 +154,3 @@ def _points(value: Array, name: str, device: Device, origin: np.ndarray | None) 
             vectors(value.numpy(), name, FARTHEST)
         return to_device(value if value.is_contiguous else value.contiguous(), device)
     return upload(vectors(value, name, FARTHEST), wp.vec3, device)
-
-
-def _prim_ids(value: ArrayLike | None, name: str, shape: tuple[int, ...], count: int) -> np.ndarray:
-    """Broadcast prim_ids to `shape`, as (N,) int32; None becomes -1. Raises InputError that names the argument."""
-    if value is None:
-        return np.full(int(np.prod(shape)), -1, np.int32)
-    array = real_numbers(value, name, f"{shape} prim_ids")
-    try:
-        array = np.broadcast_to(array, shape).reshape(-1)
-    except ValueError:
-        raise InputError(f"must be {shape} whole numbers, or broadcast with them, got {shown(array)}", argument=name) from None
-    if array.dtype.kind not in "iu":
-        raise InputError(f"must be {shape} whole numbers, got {shown(array)}", argument=name)
-    if array.size and not (array.min() >= -1 and array.max() < count):
-        row = int(np.argmax((array < -1) | (array >= count)))
-        raise InputError(f"must be -1 to {count - 1}; row {row} is {array[row]}", argument=name)
-    return array.astype(np.int32)

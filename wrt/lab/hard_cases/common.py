@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.queries.arguments import rays_of
+from wrt.accel.queries.rays import rays_on
 from wrt.core.types import Device
 from wrt.kernels.query import RayArrays
 
@@ -48,7 +49,7 @@ class HardCase:
         return len(self.origins)
 
     def on(self, device: Device) -> RayArrays:
-        return rays_on(device, rays_of(self.origins, self.directions, self.t_min, self.t_max))
+        return rays_on(device, rays_of(self.origins, self.directions, self.t_min, self.t_max)[0])
 
 
 def hard_case(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, expected: int | np.ndarray, *,

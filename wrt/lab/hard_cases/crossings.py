@@ -9,8 +9,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
-from wrt.accel.points.contains import contains
-from wrt.accel.points.enclosing import open_edges
+from wrt.accel.points.contains import contains, open_edges
 from wrt.accel.queries.all_hits import AllHits, all_hits, count_hits
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError

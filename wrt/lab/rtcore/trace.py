@@ -12,8 +12,9 @@ import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Counters
+from wrt.accel.queries.arguments import rays_of
 from wrt.accel.queries.observed import RAYS_AT_ONCE, RecordedSteps, record_steps
-from wrt.accel.queries.rays import Rays, rays_of
+from wrt.accel.queries.rays import Rays
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
 from wrt.core.files import require_file, write_bytes
@@ -228,7 +229,7 @@ def trace(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: 
     InputError
         Names the argument and what was expected.
     """
-    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max)
+    rays, _ = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max)
     parts = [Rays(*(each[begin : begin + RAYS_AT_ONCE] for each in rays)) for begin in range(0, max(len(rays.origins), 1), RAYS_AT_ONCE)]
     return joined([trace_of(record_steps(accel, *part)) for part in parts])
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -175,16 +173,6 @@ def test_a_face_without_area_is_the_segment_or_the_point_that_it_is(seed: int) -
     assert len(answers) == 1
 
 
-def test_of_segments_and_points_alone() -> None:
-    mesh = wrt.Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 5, 0]], [[0, 1, 2], [2, 0, 0], [3, 3, 3]])
-    accel = wrt.build(mesh, "bvh8")
-    found = wrt.closest_points(accel, [[1.0, 1.0, 0.0], [0.0, 7.0, 0.0], [9.0, 0.0, 0.0]])
-    assert found.prim_id.tolist() == [0, 2, 0] and found.distance.tolist() == [1.0, 2.0, 7.0]
-    assert found.point.tolist() == [[1.0, 0.0, 0.0], [0.0, 5.0, 0.0], [2.0, 0.0, 0.0]]
-    accel.refit(mesh.vertices + np.float32([0, 1, 0]))
-    assert wrt.closest_points(accel, [[1.0, 0.0, 0.0]]).distance.tolist() == [1.0]
-
-
 def spoilt(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return corners (F, 3, 3) of triangles, and the mask (F,) of triangles with one or more corners that are not finite."""
     rng = np.random.default_rng(seed)
@@ -216,52 +204,11 @@ def test_a_face_with_a_corner_that_is_not_finite_is_in_no_answer(seed: int) -> N
             assert np.array_equal(wrt.winding_number(accel, points), turns)
 
 
-def test_a_signed_distance_is_of_one_shape_whatever_is_refitted_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    ball = icosphere(2)
-    accel = wrt.build(ball, "bvh8")
-    expected = wrt.signed_distance(accel, np.zeros((1, 3)))
-
-    def contains(*asked: Any, **more: Any) -> Any:
-        inside = wrt.contains(*asked, **more)
-        accel.refit(3.0 * ball.vertices)
-        return inside
-
-    monkeypatch.setattr("wrt.accel.points.closest_points.contains", contains)
-    assert wrt.signed_distance(accel, np.zeros((1, 3))) == expected < -0.9
-    assert wrt.signed_distance(accel, np.zeros((1, 3))) < 2.0 * expected
-
-
 def test_no_faces_and_no_points() -> None:
     empty = wrt.build((np.zeros((1, 3)), np.zeros((0, 3), np.int32)), "bvh8")
     found = wrt.closest_points(empty, np.zeros((2, 3)))
     assert np.isinf(found.distance).all() and found.prim_id.tolist() == [-1, -1] and not found.point.any()
     assert len(wrt.closest_points(wrt.build(icosphere(1), "bvh8"), np.zeros((0, 3)))) == 0
-
-
-class OnGpu:
-    """A tensor that NumPy cannot read, like a torch tensor on a GPU."""
-
-    def __init__(self, array: np.ndarray) -> None:
-        self.__dlpack__, self.__dlpack_device__ = array.__dlpack__, array.__dlpack_device__
-
-    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
-        raise TypeError("can't convert cuda:0 device type tensor to numpy")
-
-
-def test_signed_distances_of_a_tensor_are_numpys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, OnGpu.__module__.partition(".")[0], SimpleNamespace(from_dlpack=OnGpu))
-    ball, points = wrt.build(icosphere(1)), np.float32([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    assert isinstance(wrt.contains(ball, OnGpu(points)), OnGpu)
-    assert np.array_equal(wrt.signed_distance(ball, OnGpu(points)), wrt.signed_distance(ball, points))
-
-
-@pytest.mark.parametrize(("call", "argument"), [
-    *((query, "points") for query in (wrt.closest_points, wrt.signed_distance, wrt.contains, wrt.winding_number)),
-    (lambda accel, points: accel.refit(points), "vertices")])
-def test_masked_points_are_refused(call: Any, argument: str) -> None:
-    ball = icosphere(1)
-    with refused(argument, "masked"):
-        call(wrt.build(ball), np.ma.masked_array(ball.vertices, ball.vertices > 0.5))
 
 
 def test_what_is_refused() -> None:

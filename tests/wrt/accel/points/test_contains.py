@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -89,38 +89,6 @@ def test_a_mesh_that_a_refit_in_place_opens_is_open() -> None:
         wrt.contains(accel, [[0.1, 0.2, 0.3]])
 
 
-def test_after_saving_a_refit_in_place_is_followed(tmp_path: Path) -> None:
-    ball = shapes.icosphere(2)
-    accel = wrt.build(ball, "bvh2", DEVICE)
-    for scale in (1.0, 2.0):
-        accel.refit(points_of(scale * ball.vertices), in_place=True)
-        accel.save(tmp_path / "ball.accel")
-        assert wrt.contains(accel, [[0.0, 1.5, 0.1]])[0] == (scale == 2.0)
-        assert round(wrt.winding_number(accel, [[0.0, 1.5, 0.1]])[0], 2) == (scale == 2.0)
-
-
-def test_a_mesh_with_a_corner_that_is_no_number_is_open() -> None:
-    ball = shapes.icosphere(1)
-    ball_points = ball.vertices.copy()
-    ball_points[7, 1] = np.nan
-    faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
-    with refused(what="mesh is not closed"):
-        wrt.contains(wrt.build(wrt.DeviceGeometry(points_of(ball_points), faces), "bvh2", DEVICE), [[0.0, 0.0, 0.0]])
-
-
-def test_points_of_another_library() -> None:
-    class Tensor:
-        array = np.array([[0.1, 0.2, 0.3], [0.0, 2.0, 0.0]], np.float32)
-
-        def __dlpack__(self, **options: object) -> object:
-            return self.array.__dlpack__(**options)  # type: ignore[arg-type]
-
-        def __dlpack_device__(self) -> tuple[int, int]:
-            return self.array.__dlpack_device__()
-
-    assert wrt.contains(wrt.build(shapes.icosphere(1)), Tensor()).tolist() == [True, False]
-
-
 def test_what_is_refused_and_what_is_empty() -> None:
     ball, none = wrt.build(shapes.icosphere(1)), np.zeros((0, 3))
     assert wrt.contains(ball, none).shape == (0,)
@@ -134,3 +102,37 @@ def test_what_is_refused_and_what_is_empty() -> None:
                                 ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure"))):
         with refused(*said):
             wrt.contains(accel, points)  # type: ignore[arg-type]
+
+
+# --- points of any leading shape --------------------------------------------------------------------------------------
+
+
+QUERIES: dict[str, Callable[..., Any]] = {
+    "contains": wrt.contains, "winding_number": wrt.winding_number, "signed_distance": wrt.signed_distance,
+    "distance": lambda *args, **more: wrt.closest_points(*args, **more).distance,
+    "point": lambda *args, **more: wrt.closest_points(*args, **more).point}
+
+
+@pytest.mark.parametrize("name", QUERIES)
+def test_points_of_any_shape(name: str) -> None:
+    query, ball = QUERIES[name], shapes.icosphere(2)
+    accel, worlds, points = wrt.build(ball), wrt.build([ball, shapes.box()]), np.float32(np.random.default_rng(0).normal(size=(4, 6, 3)))
+    rows, world = query(accel, points.reshape(-1, 3)), np.arange(6) % 2
+    own = rows.shape[1:]
+    for given, shape in ((points, (4, 6)), (points.tolist(), (4, 6)), (wp.array(points, dtype=wp.vec3, device=DEVICE), (4, 6)),
+                         (points.reshape(2, 2, 6, 3), (2, 2, 6)), (points[:0], (0, 6))):
+        found = query(accel, given)
+        assert found.shape == (*shape, *own) and found.tobytes() == rows[:found.size // max(1, int(np.prod(own)))].tobytes()
+    assert query(accel, points[1, 2]).shape == own and np.array_equal(query(accel, points[1, 2]), rows[8])
+    expected = query(worlds, points.reshape(-1, 3), world=np.tile(world, 4))
+    assert np.array_equal(query(worlds, points, world=world), expected.reshape(4, 6, *own))
+
+
+@pytest.mark.parametrize("name", QUERIES)
+def test_tensors_of_any_shape(name: str) -> None:
+    torch = pytest.importorskip("torch", reason="torch is not installed: wrt does not need it")
+    query, accel = QUERIES[name], wrt.build(shapes.icosphere(2))
+    points = torch.linspace(-1.0, 1.0, 24).reshape(2, 4, 3)
+    expected = query(accel, points.numpy())
+    assert np.array_equal(np.asarray(query(accel, points)), expected)
+    assert np.array_equal(np.asarray(query(accel, points[1, 2])), expected[1, 2])

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
 import wrt
-from tests.device import NAME as DEVICE
 from tests.refused import refused
 from wrt.scene import shapes
 
@@ -102,18 +100,6 @@ def test_an_open_mesh_is_told_by_half() -> None:
     assert below == pytest.approx(0.5, abs=1e-5) and above == pytest.approx(-0.5, abs=1e-5)
 
 
-def test_triangles_with_a_corner_that_is_not_finite_are_left_out() -> None:
-    ball = shapes.icosphere(1)
-    faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
-    expected = wrt.winding_number(wrt.build((ball.vertices, ball.faces[(ball.faces != 7).all(axis=1)])), [[0.1, 0.2, 0.3]], exact=True)
-    for value in (np.nan, np.inf):
-        points = ball.vertices.copy()
-        points[7, 1] = value
-        accel = wrt.build(wrt.DeviceGeometry(wp.array(points, dtype=wp.vec3, device=DEVICE), faces), "bvh2", DEVICE)
-        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]]) == pytest.approx(expected, abs=ERROR)
-        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]], exact=True) == pytest.approx(expected, abs=1e-12)
-
-
 def placed(seed: int, even: bool) -> np.ndarray:
     """Return a matrix that rotates, may mirror, and moves, with even or uneven scales."""
     matrix, rng = np.eye(4), np.random.default_rng(seed)
@@ -141,16 +127,6 @@ def test_instances_and_worlds_have_the_numbers_of_the_flat_mesh(exact: bool) -> 
     worlds.move(object="c", world=[0, 1], matrix=np.stack([placed(3, False), placed(2, False)]))
     swapped = wrt.winding_number(worlds, points, exact=exact, world=1 - world)
     np.testing.assert_array_equal(swapped, found)
-
-
-def test_an_instance_that_maps_points_exactly_has_the_bits_of_the_flat_mesh() -> None:
-    ball, matrix = shapes.icosphere(2), np.eye(4)
-    matrix[:3, 3] = 0.5, -2.0, 1.0
-    points = np.round(np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3)) * 4096.0) / 4096.0
-    one = wrt.build(wrt.Scene((wrt.Object(ball, (wrt.Material(),), matrix),)), movable=True)
-    for exact in (False, True):
-        expected = wrt.winding_number(wrt.build(ball), points - matrix[:3, 3], exact=exact)
-        assert np.array_equal(wrt.winding_number(one, points, exact=exact), expected)
 
 
 @pytest.mark.filterwarnings("error")

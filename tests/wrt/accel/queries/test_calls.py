@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import re
-import sys
-import threading
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
-from tests.kernel_tools import DEVICE, cpu_only
+import wrt
+from tests.kernel_tools import DEVICE
 from tests.refused import Refusal, refused
-from wrt.accel import queries
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy, to_warp
-from wrt.core.warp_private import RawLaunch
-from wrt.scene.mesh import Mesh
-from wrt.scene.shapes import icosphere
+from wrt.kernels.query import FARTHEST, LARGEST
+from wrt.scene.shapes import box, icosphere
 
 NAMES = "bvh8", "bvh2"  # with and without a kernel for many rays at a time
 MANY = 2 * FEWEST + 77
@@ -57,25 +52,6 @@ def frozen(a: np.ndarray) -> np.ndarray:
     return a
 
 
-@cpu_only
-@pytest.mark.parametrize("n", [1, MANY])
-def test_the_way_of_a_query_is_short(n: int) -> None:
-    """Between call and launch, Python runs only the files that the docstring of wrt.accel.queries names, and wrt.core."""
-    accel, rays, files = build(icosphere(3)), some_rays(n), set()
-    accel.closest_hit(*rays, threads=1)
-
-    def note(frame: Any, event: str, _: Any) -> None:
-        if event == "call" and frame.f_globals["__name__"].startswith(("wrt.accel.", "wrt.core.")):
-            files.add(frame.f_globals["__name__"])
-
-    sys.setprofile(note)
-    accel.closest_hit(*rays, threads=1)
-    sys.setprofile(None)
-    named = {f"wrt.accel.queries.{name}" for name in re.findall(r"(\w+)\.py\s\(", queries.__doc__ or "")}
-    assert len(named) == 5
-    assert files - {f"wrt.core.{name}" for name in ("arrays", "device", "threads", "warp_private")} == named
-
-
 FORMS = {
     "float64": lambda a: a.astype(np.float64), "big-endian": lambda a: a.astype(">f4"), "fortran": np.asfortranarray,
     "strided": lambda a: np.repeat(a, 2, axis=0)[::2], "reversed": lambda a: a[::-1].copy()[::-1], "unaligned": unaligned,
@@ -95,16 +71,6 @@ def test_arrays_of_any_form_give_the_same_bits(ball: Accelerator, form: str, n: 
         assert bits(ball.closest_hit(*given, threads=threads)) == bits(expected)
         assert np.array_equal(ball.any_hit(*given, threads=threads), occluded)
     assert bits(ball.closest_hit(origins, given[1], t_min, given[3])) == bits(expected)  # mixed
-
-
-@pytest.mark.parametrize("form", ["float64", "fortran", "unaligned"])
-def test_counters_are_those_of_the_same_ray(ball: Accelerator, form: str) -> None:
-    rays = some_rays(MANY)
-    expected = ball.closest_hit(*rays, trace=True).counters
-    found = ball.closest_hit(*map(FORMS[form], rays), trace=True, threads=2).counters
-    for name in ("counts", "first", "address", "size"):
-        assert np.array_equal(getattr(found, name), getattr(expected, name))
-    assert len(np.unique(expected.counts["nodes"])) > 1  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("n", [5, MANY])
@@ -157,42 +123,6 @@ def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: A
         ball.closest_hit(*rays, out=Hits(**room))
 
 
-@pytest.mark.parametrize("as_warp", [False, True])
-def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) -> None:
-    """Arrays of different types or that share only a part are refused, too. Adjacent arrays are accepted."""
-    rays: tuple[Any, ...] = some_rays(4)
-    memory, own = np.zeros(16, np.float32), [np.zeros(4, np.float32) for _ in range(2)]
-    whole: Any = to_warp(memory).to(DEVICE) if as_warp else memory
-    if as_warp:
-        rays, own = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a).to(DEVICE) for a in own]
-
-    def ids(begin: int) -> Any:
-        part = whole[begin:begin + 4]
-        return part.view(wp.int32) if as_warp else part.view(np.int32)
-
-    t = whole[:4]
-    for room, named in (((t, own[0], t, ids(8)), ("out.t", "out.v")), ((own[0], own[1], t, ids(0)), ("out.v", "out.prim_id")),
-                        ((own[0], t, whole[3:7], ids(8)), ("out.u", "out.v")), ((whole[5:9], own[0], own[1], ids(2)),
-                                                                             ("out.t", "out.prim_id"))):
-        with refused(*named):
-            ball.closest_hit(*rays, out=Hits(*room))
-    room = t, whole[4:8], whole[12:], ids(8)
-    assert bits(ball.closest_hit(*rays, out=Hits(*room))) == bits(ball.closest_hit(*rays))
-
-
-def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
-    rays = some_rays(3)
-    on_warp = tuple(to_warp(a, wp.vec3) for a in rays)
-    with refused("out", "Hits"):
-        ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
-    with refused("out", "NumPy array (3,)"):
-        ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    for wrong in (np.zeros(3, bool), wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
-                  wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
-        with refused("out"):
-            ball.any_hit(*on_warp, out=wrong)
-
-
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
@@ -222,15 +152,6 @@ def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: s
     assert (ball.closest_hit(*arrays).prim_id[::2] == -1).all()
 
 
-def test_origins_are_named_before_what_follows(ball: Accelerator) -> None:
-    origins, directions = some_rays(MANY)
-    origins[-1], directions[0], directions[1] = np.nan, 0.0, np.inf
-    with refused("origins", f"row {MANY - 1} is"):
-        ball.closest_hit(origins, directions, np.full(MANY, -1.0), threads=2)
-    with refused("directions", "row 1"):
-        ball.closest_hit(origins[:-1], directions[:-1], threads=2)
-
-
 def test_numbers_of_warp_arrays_are_not_looked_at_but_for_segments(ball: Accelerator) -> None:
     origins, directions = some_rays(MANY)
     expected = ball.closest_hit(origins, directions).prim_id
@@ -258,33 +179,6 @@ def test_a_structure_answers_after_an_error(ball: Accelerator) -> None:
 # --- several structures and threads -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_structures_that_take_turns_answer_for_themselves(name: str) -> None:
-    sphere = icosphere(2)
-    small, large = (build(Mesh(np.float32(size) * sphere.vertices, sphere.faces), name) for size in (0.5, 2.0))
-    origins, directions = np.float32([[0, 0, 5]]), np.float32([[0.01, 0.02, -1]])
-    expected = [accel.closest_hit(origins, directions).t.item() for accel in (small, large)]
-    assert expected[0] > 4.4 > 3.2 > expected[1]
-    for i in (0, 1, 1, 0, 0, 1):
-        assert (small, large)[i].closest_hit(origins, directions).t.item() == expected[i]
-
-
-def test_calls_of_all_sizes_on_several_threads(ball: Accelerator) -> None:
-    asked = [some_rays(n, n) for n in (1, 40, 300, FEWEST + 1, MANY)]
-    asked = [(o.astype(np.float64 if i % 2 else np.float32), d) for i, (o, d) in enumerate(asked)]
-    alone = [bits(ball.closest_hit(*rays, threads=1)) for rays in asked]
-    dark = [ball.any_hit(*rays, threads=1).tobytes() for rays in asked]
-
-    def ask(i: int) -> None:
-        for k in range(i, i + 15):
-            k = k % len(asked)
-            assert bits(ball.closest_hit(*asked[k], threads=1 + i % 3)) == alone[k]
-            assert ball.any_hit(*asked[k]).tobytes() == dark[k]
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(ask, range(8)))
-
-
 # --- what a call costs ------------------------------------------------------------------------------------------------
 
 
@@ -310,27 +204,19 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
     assert dark.nbytes == n
 
 
-def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    accel = build(icosphere(1), "bvh8", device="cpu")
-    rays = some_rays(FEWEST)
-    seen: set[int] = set()
-    launch = RawLaunch.launch
-    monkeypatch.setattr(RawLaunch, "launch", lambda self, *a: (seen.add(threading.get_ident()), launch(self, *a))[1])
-    for form in (np.asarray, np.float64):
-        accel.closest_hit(form(rays[0]), rays[1], threads=8)  # type: ignore[operator]
-        accel.any_hit(form(rays[0]), rays[1])  # type: ignore[operator]
-    assert seen == {threading.get_ident()}
+# --- the largest coordinates ------------------------------------------------------------------------------------------
 
 
-def test_a_call_packs_no_launch_and_makes_no_warp_array(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Each of these costs as much as the rest of a call with one ray.
-    accel = build(icosphere(1), "bvh8", device="cpu")
-    asked = [some_rays(n) for n in (1, 5000)]
-    expected = [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked]
 
-    def refuse(*arguments: Any, **options: Any) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(wp, "launch", refuse)
-    monkeypatch.setattr(wp.array, "__init__", refuse)
-    assert [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked] == expected
+@pytest.mark.parametrize("n", [1, 64])  # one ray, and packets
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_limits_themselves_are_accepted(n: int, sign: float) -> None:
+    accel = wrt.build(box())
+    far, near = np.zeros((n, 3), np.float32), np.full((n, 3), (0.1, 0.2, 5.0), np.float32)
+    far[:, 1] = sign * float(FARTHEST)
+    down, fast = np.full((n, 3), (0.0, 0.0, -1.0), np.float32), np.full((n, 3), (0.0, 0.0, -float(LARGEST)), np.float32)
+    assert (accel.closest_hit(far, down).prim_id == -1).all()
+    hits = accel.closest_hit(near, fast)
+    assert (hits.prim_id >= 0).all() and (hits.t <= np.float32(5.0) / np.float32(LARGEST)).all()
+    with pytest.raises(wrt.InputError):
+        accel.closest_hit(np.nextafter(far, np.float32(sign * np.inf)), down)

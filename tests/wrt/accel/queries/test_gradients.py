@@ -201,14 +201,6 @@ def test_a_tape_goes_through_a_refit_and_hits(accel: str) -> None:
     assert not points.grad.numpy().any() and not hits.t.grad.numpy().any()
 
 
-def test_no_rays_on_a_tape() -> None:
-    structure, none = wrt.build(shapes.icosphere(1)), vec3s(np.zeros((0, 3)), requires_grad=True)
-    loss = wp.zeros(1, dtype=float, device=DEVICE, requires_grad=True)
-    with wp.Tape() as tape:
-        assert len(structure.closest_hit(none, none).point) == 0
-    tape.backward(loss)
-
-
 def test_what_a_tape_would_wait_for_in_vain_is_refused() -> None:
     rng = np.random.default_rng(6)
     ball, (origins, directions) = shapes.icosphere(1), map(vec3s, rays(rng, 20))

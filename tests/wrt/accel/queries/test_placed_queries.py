@@ -146,14 +146,6 @@ def test_of_instances_at_the_same_distance_the_first_has_the_closest_point(swapp
     np.testing.assert_allclose(found.distance, 0.3 * above[:, 2], rtol=1e-6)
 
 
-def test_a_structure_keeps_its_mesh_when_the_caller_writes_to_the_arrays() -> None:
-    mesh = icosphere(2)
-    accel = wrt.build(Scene((Object(mesh, (GREY,)),)), movable=True)
-    mesh.vertices[:], mesh.faces[:] = 7.0, 0
-    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3))
-    np.testing.assert_allclose(wrt.winding_number(accel, inside), 1.0, atol=1e-3)
-
-
 def test_inside_by_parity_over_instances() -> None:
     worlds, flat = structures()
     points, _, world = rays(2000)
@@ -173,19 +165,3 @@ def test_visible_over_worlds() -> None:
         assert np.array_equal(seen[world == w], wrt.visible(one, a[world == w], b[world == w]))
     with refused("world"):
         wrt.visible(worlds, a, b)
-
-
-def test_objects_and_materials_are_those_of_the_world() -> None:
-    worlds, flat = structures()
-    origins, directions, world = rays(2000)
-    hits = worlds.closest_hit(origins, directions, world=world)
-    for w, one in enumerate(flat):
-        rows = world == w
-        expected = one.closest_hit(origins[rows], directions[rows])
-        assert np.array_equal(hits.object[rows], expected.object)
-        assert np.array_equal(hits.material[rows], expected.material)
-    first = worlds.geometry.first_instance
-    assert np.array_equal(hits.instance, np.where(hits.object < 0, -1, hits.object + first[world]))
-    meshes = wrt.build([scenes()[0].objects[0].mesh] * 2)
-    alone = meshes.closest_hit(origins, directions, world=1)
-    assert set(alone.object) == set(alone.material) == {-1, 0}

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -133,24 +129,6 @@ def test_other_launches_by_kernels_are_refused(change: Callable[[Any], Any], mon
 
 
 @pytest.mark.usefixtures("not_tested")
-@pytest.mark.parametrize("name", ["params", "hooks"])
-def test_a_command_without_its_parts_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = warp_private.recorded
-
-    class Without:
-        def __init__(self, command: Any) -> None:
-            self.command = command
-
-        def __getattr__(self, asked: str) -> Any:
-            if asked == name:
-                raise AttributeError(f"'Launch' object has no attribute {name!r}")
-            return getattr(self.command, asked)
-
-    monkeypatch.setattr(warp_private, "recorded", lambda command: recorded(Without(command)))
-    refused_for(f"'Launch' object has no attribute {name!r}")
-
-
-@pytest.mark.usefixtures("not_tested")
 def test_a_write_beside_the_array_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """The write goes to the word before the array."""
     struct = warp_private.struct_record
@@ -171,24 +149,3 @@ def test_a_query_and_a_picture_are_refused(monkeypatch: pytest.MonkeyPatch) -> N
     for ask in (query, lambda: wrt.render(scene, size=(8, 8), spp=1)):
         with refused(what="launches by kernels"):
             ask()
-
-
-BROKEN = """
-import sys
-import wrt.accel.queries.raw_launches as raw_launches
-raw_launches._has_arguments = lambda *arrays: False
-sys.argv = ["wrt", *sys.argv[1:]]
-from wrt.cli.main import main
-main()
-"""
-
-
-def test_the_command_line_ends_with_one_message(tmp_path: Path) -> None:
-    picture = tmp_path / "out.png"
-    done = subprocess.run([sys.executable, "-c", BROKEN, "render", ROOT / "scenes" / "whitted.toml", "--size", "8x8", "--spp", "1",
-                           "--quiet", "-o", picture], capture_output=True, text=True,
-                          env=os.environ | {"PYTHONPATH": str(ROOT)})
-    assert (done.returncode, done.stdout) == (2, "") and not picture.exists()
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
-    assert done.stderr.endswith(f"Warp {wp.config.version} is not supported, its insides differ (arguments of launches);"
-                                f" install 'warp-lang>=1.19,<1.20'\n")

@@ -10,7 +10,7 @@ import warp as wp
 
 import wrt
 from tests.kernel_tools import DEVICE, cpu_only, floats, launch, vec3s, zeros
-from tests.refused import Refusal, refused
+from tests.refused import refused
 from tests.wrt.accel.queries.test_all_hits import rays, soup
 from wrt.scene import shapes
 
@@ -134,23 +134,12 @@ def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureF
     assert "accel.world is of another structure or triangle test" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("arguments, said", [
-    ({"triangle": ["watertight"]}, ("triangle",)), ({"box": "round"}, ("box", "no box test 'round'"))])
-def test_tests_that_there_are_not(arguments: dict, said: Refusal) -> None:
-    with refused(*said):
-        wrt.ray_query("bvh", **arguments)
-    with refused(next(iter(arguments))):
-        wrt.ray_query(wrt.build(shapes.icosphere(1)), **arguments)
-
-
-@pytest.mark.parametrize("accel, said", [("bvg", ("accel", "no structure 'bvg'")), (3, ("accel", "structure without spheres"))])
-def test_what_is_refused(accel: object, said: Refusal) -> None:
-    with refused(*said):
-        wrt.ray_query(accel)
-
-
-def test_what_replaces_a_sphere_is_in_the_message() -> None:
-    accel = wrt.build(wrt.Scene(spheres=(wrt.Sphere((0.0, 0.0, 0.0), 1.0, wrt.Material()),)))
-    for ask in (lambda: wrt.ray_query(accel), lambda: wrt.all_hits(accel, np.zeros((1, 3)), np.ones((1, 3)))):
+def test_what_is_refused() -> None:
+    ball, sphere = wrt.build(shapes.icosphere(1)), wrt.build(wrt.Scene(spheres=(wrt.Sphere((0.0, 0.0, 0.0), 1.0),)))
+    for arguments, options, said in ((("bvh",), {"triangle": ["watertight"]}, "triangle"), (("bvh",), {"box": "round"}, "box"),
+                                     ((ball,), {"box": "watertight"}, "box"), (("bvg",), {}, "accel"), ((3,), {}, "accel")):
+        with refused(said):
+            wrt.ray_query(*arguments, **options)
+    for ask in (lambda: wrt.ray_query(sphere), lambda: wrt.all_hits(sphere, np.zeros((1, 3)), np.ones((1, 3)))):
         with refused("accel", "without spheres", hint="icosphere"):
             ask()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from typing import Any
 
 import numpy as np
@@ -11,8 +9,10 @@ import pytest
 import warp as wp
 
 import wrt
+import wrt.sensors
 from tests.kernel_tools import DEVICE
 from tests.refused import refused
+from wrt.accel.queries.batches import copy_from_tiles, copy_to_tiles, tiled_width
 from wrt.core.arrays import to_numpy
 from wrt.scene.shapes import icosphere
 
@@ -85,8 +85,7 @@ def test_segments_worlds_counters_and_out_have_the_rays_shape(ball: Any) -> None
     hits = ball.closest_hit(o, d, t_max=ends, trace=True)
     assert_same(hits, rows, SHAPE)
     np.testing.assert_array_equal(hits.counters.nodes.reshape(-1), rows.counters.nodes)
-    np.testing.assert_array_equal(hits[1:].counters.address, rows[5:].counters.address)
-    np.testing.assert_array_equal(rows[[7]].counters.address, rows.counters.address[rows.counters.first[7]:rows.counters.first[8]])
+    np.testing.assert_array_equal(hits.counters.address, rows.counters.address)
     out = wrt.build(icosphere(1)).closest_hit(o, d)
     assert np.shares_memory(ball.closest_hit(o, d, t_max=ends, out=out).t, out.t)
     np.testing.assert_array_equal(out.t, hits.t)
@@ -149,55 +148,19 @@ def test_gradients_have_the_rays_shape(ball: Any) -> None:
         ball.closest_hit(leaves[0][:1], leaves[1])
 
 
-@pytest.mark.parametrize("form", [np.asarray, lambda array: wp.array(array, dtype=wp.vec3, device=DEVICE)])
-def test_hits_of_several_dimensions_get_another_shape(ball: Any, form: Any) -> None:
-    o, d = some_rays(*SHAPE)
-    rows = ball.closest_hit(o.reshape(-1, 3), d.reshape(-1, 3))
-    hits = ball.closest_hit(form(o), form(d), counters=True).in_shape((5, 1, 3))
-    assert hits.counters.nodes.shape == (5, 1, 3)
-    assert_same(hits, rows, (5, 1, 3))
-
-
-def test_unknown_names_are_answered_with_the_way(ball: Any) -> None:
-    hits = ball.closest_hit(*some_rays(4), counters=True)
-    for thing, name in ((hits, "normls"), (hits.counters, "node"), (ball, "closst_hit"), (wrt, "buildd")):
-        with pytest.raises(AttributeError) as caught:
-            getattr(thing, name)
-        assert (caught.value.name, caught.value.obj) == (name, thing)  # from which Python suggests the most similar name
-    with pytest.raises(TypeError, match=r"write hits\.t in place of"):
-        _ = hits["t"]
-    assert not hasattr(hits, "__array__") and not hasattr(hits, "wheels")
-    for thing, name, said in ((ball, "contains", "wrt.contains(accel, ...)"), (ball, "move", "movable=True"), (ball, "to", "device=")):
+def test_unknown_names_are_answered_with_the_nearest(ball: Any) -> None:
+    for name, said in (("buildd", "'build'"), ("pinhole", "wrt.sensors.pinhole"), ("any_hit", "wrt.build(mesh).any_hit")):
         with pytest.raises(AttributeError) as error:
-            getattr(thing, name)
+            getattr(wrt, name)
         assert said in str(error.value)
-    for argument, hint, call in (
-            ("accel", "wrt.build((vertices, faces))", lambda: wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))),  # type: ignore[call-overload]
-            ("accel", "wrt.build(mesh)", lambda: wrt.closest_points(icosphere(1), (0.0, 0.0, 0.0))),  # type: ignore[arg-type]
-            ("mesh", "wrt.Mesh.from_trimesh", lambda: wrt.Object(icosphere)),  # type: ignore[arg-type]
-            ("objects[0]", "wrt.Scene.of", lambda: wrt.Scene([icosphere(1)]))):  # type: ignore[arg-type]
-        with refused(argument, hint=hint):
-            call()
-
-
-def test_an_object_and_a_sphere_are_grey_unless_a_material_is_given() -> None:
-    scene = wrt.Scene((wrt.Object(icosphere(1)), wrt.Object(icosphere(2))), wrt.Sphere((0.0, 3.0, 0.0), 1.0))
-    assert [material.albedo for material in scene.materials] == [wrt.Material().albedo] and wrt.build(scene) is not None
+    with pytest.raises(TypeError, match=r"write hits\.t in place of"):
+        _ = ball.closest_hit(*some_rays(4))["t"]
 
 
 def test_a_mesh_of_warp_is_a_mesh(ball: Any) -> None:
     mesh = icosphere(3)
     warps = wp.Mesh(wp.array(mesh.vertices, dtype=wp.vec3, device=DEVICE), wp.array(mesh.faces.reshape(-1), dtype=int, device=DEVICE))
     assert np.array_equal(wrt.build(warps).closest_hit(*some_rays(50)).t, wrt.build(mesh).closest_hit(*some_rays(50)).t)
-
-
-def test_copied_hits_say_that_they_have_lost_their_rays(ball: Any) -> None:
-    hits = ball.closest_hit((0.0, 0.0, 5.0), (0.0, 0.0, -1.0))
-    for lost in (copy.copy(hits), copy.deepcopy(hits), pickle.loads(pickle.dumps(hits))):
-        assert lost.t == hits.t and lost.hit
-        for name in ("distance", "points", "normals", "object"):
-            with refused(what="lose all"):
-                getattr(lost, name)
 
 
 def test_what_is_refused(ball: Any) -> None:
@@ -225,7 +188,72 @@ def test_a_scene_of_meshes_is_one_world() -> None:
     accel = wrt.build(wrt.Scene.of([near, (far.vertices, far.faces)]))
     hits = accel.closest_hit([[0.0, 0.0, 3.0]] * 2, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     np.testing.assert_array_equal(hits.object, [0, 1])
-    with refused("meshes[1]", "must be a mesh", hint="load_mesh"):
-        wrt.Scene.of([near, "far.ply"])
-    with refused("meshes[0]", "an Object or a Sphere"):
-        wrt.Scene.of([3])
+
+
+# --- small pictures, which are traced in tiles of pixels --------------------------------------------------------------
+
+
+SHAPES = [(3, 40, 36), (2, 3, 32, 20), (64, 256), (300, 4, 4), (2, 33, 64), (40, 34), (8, 260), (260, 8)]
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return wrt.build([icosphere(3), icosphere(2)])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_pictures_have_the_bits_of_rows(worlds, shape) -> None:
+    """Also with segments and a world of each ray, on one thread and on two."""
+    ball, rng = wrt.build(icosphere(3)), np.random.default_rng(len(shape))
+    origins = (rng.normal(size=(*shape, 3)) * 0.5 + (0.0, 0.0, 4.0)).astype(np.float32)
+    directions = (rng.normal(size=(*shape, 3)) * 0.3 - (0.0, 0.0, 4.0)).astype(np.float32)
+    t_min, world = rng.uniform(0.0, 1.0, shape).astype(np.float32), rng.integers(0, 2, shape).astype(np.int32)
+    rows = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    for accel, options, flat in ((ball, {}, {}), (ball, {"t_min": t_min}, {"t_min": t_min.reshape(-1)}),
+                                 (worlds, {"world": world}, {"world": world.reshape(-1)})):
+        expected, occluded = accel.closest_hit(*rows, **flat), accel.any_hit(*rows, **flat)
+        assert 0 < occluded.sum() < occluded.size
+        for threads in (1, 2):
+            hits = accel.closest_hit(origins, directions, threads=threads, **options)
+            assert all(getattr(hits, name).tobytes() == getattr(expected, name).tobytes() for name in FIELDS)
+            assert np.array_equal(accel.any_hit(origins, directions, threads=threads, **options).reshape(-1), occluded)
+
+
+def test_pictures_of_other_types_and_orders_have_the_bits_of_rows() -> None:
+    """float64 rays are converted, and arrays with gaps copied, block by block; values beyond float32 become infinite."""
+    ball, rng, shape = wrt.build(icosphere(3)), np.random.default_rng(1), (2, 64, 32)
+    origins, directions = rng.normal(size=(*shape, 3)) * 0.5 + (0.0, 0.0, 4.0), rng.normal(size=(*shape, 3)) * 0.3 - (0.0, 0.0, 4.0)
+    ends = np.where(rng.random(shape) < 0.5, 1e300, 3.5)
+    rays = [np.float32(each).reshape(-1, 3) for each in (origins, directions)]
+    expected = ball.closest_hit(*rays, t_max=np.where(ends > 4.0, np.inf, 3.5).astype(np.float32).reshape(-1))
+    for each in (origins, np.float32(origins), np.repeat(np.float32(origins), 2, axis=-1)[..., ::2]):
+        hits = ball.closest_hit(each, directions, t_max=ends)
+        assert all(getattr(hits, name).tobytes() == getattr(expected, name).tobytes() for name in FIELDS)
+
+
+def test_a_bad_ray_of_a_picture_is_named_by_its_place_among_the_rays() -> None:
+    directions = np.full((32, 64, 3), 1.0, np.float32)
+    directions[5, 7] = 0.0
+    with pytest.raises(wrt.InputError, match=str(5 * 64 + 7)):
+        wrt.build(icosphere(1)).closest_hit(np.zeros((32, 64, 3), np.float32), directions)
+
+
+def test_tiles_are_squares_of_a_picture() -> None:
+    places = np.indices((8, 12), np.float32).reshape(2, -1).T.copy()
+    tiles, back = np.empty_like(places), np.empty_like(places)
+    copy_to_tiles(tiles, places, tiled_width((8, 12)))
+    assert (np.ptp(tiles.reshape(-1, 16, 2), axis=1) == 3.0).all()
+    copy_from_tiles(back, tiles, 12)
+    assert np.array_equal(back, places)
+
+
+@pytest.mark.parametrize("library", ["numpy", "warp"])
+def test_a_sensors_rays_are_pictures_in_the_same_memory(library: str) -> None:
+    poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    poses[:, 2, 3] = -4.0, -5.0, -6.0
+    sensor = wrt.sensors.pinhole(np.diag([64.0, 64.0, 1.0]), (64, 32), poses, like=wp.zeros(1, device="cpu") if library == "warp" else None)
+    ball, lists = wrt.build(icosphere(3)), (sensor.origins, sensor.directions)
+    pictures, rows = ball.closest_hit(*sensor.rays), ball.closest_hit(*lists)
+    assert pictures.t.shape == sensor.shape
+    assert np.array_equal(np.asarray(sensor.depth(pictures)), np.asarray(sensor.depth(rows)))
+    assert all(np.shares_memory(np.asarray(a), np.asarray(b)) for a, b in zip(sensor.rays, lists, strict=True))

@@ -21,10 +21,8 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.scenes.build import build, load_accel
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.device import load_kernel, made_once, start
+from wrt.core.device import made_once
 from wrt.core.errors import InputError
-from wrt.core.warp_private import RawLaunch
-from wrt.kernels.structs import kernel
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
 from wrt.scene.materials import Material
@@ -148,36 +146,6 @@ def test_what_is_asked_during_refits_is_of_one_shape(name: str, often: None) -> 
         assert answer in (known[0][which], known[1][which]), "a mixture of two shapes"
 
 
-@pytest.mark.parametrize("ask", [
-    lambda accel, rays: bits(accel.closest_hit(*rays, threads=1)), lambda accel, rays: accel.any_hit(*rays, threads=1).tobytes(),
-    lambda accel, rays: bits(accel.closest_hit(*rays, threads=1, counters=True)),
-    lambda accel, rays: bits(accel.closest_hit(*rays, threads=1, trace=True)),
-], ids=["closest_hit", "any_hit", "counters", "trace"])
-@pytest.mark.parametrize("name", ["bvh2", "bvh8", "bvh8c"])
-def test_a_refit_between_two_launches_of_a_query_waits_for_the_next(name: str, ask: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    accel, rays = build(BALL, name), some_rays(2 * RAYS_PER_LAUNCH)
-    accel.refit(SHAPES[1])
-    after = ask(accel, rays)
-    accel.refit(SHAPES[0])
-    before = ask(accel, rays)
-    launches: list[int] = []
-
-    def and_refit(launch: Any) -> Any:
-        def launch_and_refit(*arguments: Any, **options: Any) -> None:
-            launch(*arguments, **options)
-            launches.append(1)
-            if len(launches) == 1:
-                accel.refit(SHAPES[1])
-
-        return launch_and_refit
-
-    monkeypatch.setattr(wp, "launch", and_refit(wp.launch))
-    monkeypatch.setattr(RawLaunch, "launch", and_refit(RawLaunch.launch))
-    assert ask(accel, rays) == before != after
-    monkeypatch.undo()
-    assert len(launches) > 1 and ask(accel, rays) == after
-
-
 def test_refits_come_one_after_another_and_what_is_saved_is_whole(tmp_path: Any, often: None) -> None:
     accel, rays = build(BALL, "bvh2"), some_rays(500)
     geometries = [Geometry(vertices, BALL.faces, np.zeros((0, 4), np.float32)) for vertices in SHAPES]
@@ -249,19 +217,6 @@ def test_a_failure_is_not_kept() -> None:
     assert make() == make() == 5 and len(tries) == 2
 
 
-def test_a_kernel_is_compiled_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, loads = start("cpu"), []
-
-    @kernel
-    def nothing(out: wp.array(dtype=wp.float32)):  # type: ignore[valid-type]
-        out[wp.tid()] = 5.0
-
-    load = nothing.module.load
-    monkeypatch.setattr(nothing.module, "load", lambda *arguments, **options: (loads.append(1), load(*arguments, **options)))
-    at_a_time(*[lambda: load_kernel(nothing, device)] * 8)
-    assert len(loads) == 1
-
-
 def test_scenes_are_rendered_on_several_threads() -> None:
     camera, other = (Camera.look_at(position, (0, 0, 0)) for position in ((0, 1, 4), (3, 0, 2)))
     scene = Scene(Object(BALL, Material()), lights=PointLight((2, 5, 3), 50), cameras=camera)
@@ -274,14 +229,3 @@ def test_scenes_are_rendered_on_several_threads() -> None:
             assert wrt.render(scenes[k % 3], size=(24, 16), spp=2, threads=2).pixels.tobytes() == alone[k % 3]
 
     at_a_time(*(lambda i=i: draw(i) for i in range(4)))  # type: ignore[misc]
-
-
-def test_structures_are_built_and_asked_on_several_threads() -> None:
-    rays = some_rays(100)
-    expected = {name: bits(build(BALL, name).closest_hit(*rays)) for name in ("bvh8", "bvh2", "kdtree", "grid")}
-
-    def work() -> None:
-        for name, answer in expected.items():
-            assert bits(build(BALL, name, threads=2).closest_hit(*rays)) == answer
-
-    at_a_time(*[work] * 4)

@@ -153,7 +153,7 @@ def test_a_ray_costs_what_it_costs_in_its_world_alone() -> None:
 @pytest.mark.parametrize("world, told", [
     (None, ("world", "not be None")), (7, ("world", "0 to 6")),
     (-1, ("world", "0 to 6")),
-    (1.0, ("world", "whole number or (2,)")), ([0, 1, 2], ("world", "whole number or (2,)")),
+    (1.0, ("world", "whole number or (2,)")), ([0, 1, 2], ("world", "(2,)")),
     ("first", ("world", "number or (2,)")),
     (wp.zeros(2, dtype=wp.int64, device="cpu"), ("world", "(2,) int32")),
 ])
