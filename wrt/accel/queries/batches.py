@@ -15,7 +15,7 @@ from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
 from wrt.core.threads import FreeList, run_all, thread_count
-from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
+from wrt.core.types import Array, Device, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
@@ -288,20 +288,14 @@ def trace_one_by_one(snapshot: Snapshot, query: Query) -> None:
     part = n if rays.as_warp or more else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
-        rays_of_part, out_of_part = (rays, out) if part >= n else (Rays(*(array[some] for array in rays)), [array[some] for array in out])
-        inputs = [snapshot.data, snapshot.surfaces, rays_on(device, rays_of_part), *more]
-        launch_over(device, kernel, inputs, out_of_part, thread_count(query.threads))
-
-
-def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: Sequence[Array], threads: int) -> None:
-    """Launch a kernel that traces one ray per thread over all rays, and write the results to `out`."""
-    on_device = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
-                 else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
-    hits = filled(HitArrays, on_device) if len(out) > 1 else on_device[0]
-    launch_on(device, kernel, len(out[0]), *inputs, hits, None, threads=threads, step=RAYS_PER_LAUNCH)
-    for array, result in zip(out, on_device, strict=True):
-        if not isinstance(array, wp.array) and device.is_cuda:
-            array[:] = result.numpy()
+        own, targets = (rays, out) if part >= n else (Rays(*(array[some] for array in rays)), [array[some] for array in out])
+        there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
+                 else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in targets]
+        launch_on(device, kernel, len(targets[0]), snapshot.data, snapshot.surfaces, rays_on(device, own), *more,
+                  filled(HitArrays, there) if len(out) > 1 else there[0], None, threads=thread_count(query.threads), step=RAYS_PER_LAUNCH)
+        for array, result in zip(targets, there, strict=True):
+            if not isinstance(array, wp.array) and device.is_cuda:
+                array[:] = result.numpy()
 
 
 def tiled_width(shape: tuple[int, ...]) -> int:

@@ -74,9 +74,8 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
     is 0 for misses and if M is singular in float64. It grows as 1 / cos of the angle between ray and normal.
     """
     prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # float32, as in the query
-    vertices, faces = geometry.vertices, geometry.faces
-    n = len(prim_id)
-    by_hits = cotangents.checked((n,))
+    by_hits, prim_id = cotangents.checked(prim_id.shape), prim_id.reshape(-1)
+    vertices, faces, n = geometry.vertices, geometry.faces, len(prim_id)
     out = Gradients(np.zeros((len(vertices), 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     rows = np.flatnonzero((prim_id >= 0) & (prim_id < len(faces)))
     corners = faces[prim_id[rows]]

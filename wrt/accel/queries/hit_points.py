@@ -226,8 +226,7 @@ class HitPoints(HitIds[ArrayT]):
         snapshot.structure.require_one_mesh(ONE_MESH)
         shape = self.shape
         give: Any = to_tensor_like(self.t)
-        cotangents = Cotangents(t, u, v, point).checked(shape)
-        found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, to_numpy(self.prim_id).reshape(-1), cotangents)
+        found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, to_numpy(self.prim_id), Cotangents(t, u, v, point))
         found = Gradients(found.vertices, *(each.reshape(*shape, 3) for each in found[1:]))
         if give is not None:
             found = Gradients(*map(give, found))
