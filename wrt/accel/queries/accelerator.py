@@ -115,8 +115,8 @@ class Accelerator:
     def closest_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                     threads: int | None = ..., *, out: Hits[TensorT] | None = ..., **options: Unpack[HitOptions]) -> Hits[TensorT]: ...
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                    threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
-                    invalid: str = "raise", counters: bool = False, trace: bool = False) -> Hits[Any]:
+                    threads: int | None = None, *, out: Hits[Any] | None = None, counters: bool = False, trace: bool = False,
+                    **options: Unpack[RayOptions]) -> Hits[Any]:
         """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
         With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
@@ -155,7 +155,7 @@ class Accelerator:
         """
         snapshot = self.snapshot  # read once, because a refit may replace it during the query
         query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
-                                    None if out is None else arrays_of(out), world, invalid)
+                                    None if out is None else arrays_of(out), **options)
         counts = None
         if counters or trace:
             counts = counted(snapshot, query, fetches_too=trace)
