@@ -33,6 +33,13 @@ class NoOptions:
     """Empty options, for a structure without options."""
 
 
+def require_between(**options: tuple[float, float, float]) -> None:
+    """Raise InputError for an option whose value is out of range. options: name=(value, low, high)."""
+    for name, (value, low, high) in options.items():
+        if not low <= value <= high:
+            raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)
+
+
 def options_of(name: str, options: type[T], values: dict[str, object]) -> T:
     """Make the options of a structure. Raises InputError for unknown options, wrong types and values out of range."""
     known, types = {field.name: field for field in fields(options)}, get_type_hints(options)  # type: ignore[arg-type]

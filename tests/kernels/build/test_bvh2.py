@@ -223,7 +223,7 @@ def test_spatial_splits_stay_within_their_budget():
     references = [build(geometry, "bvh2", builder="sbvh", split_budget=b).stats.references for b in (0.0, 0.3, 2.0)]
     assert references[0] == 400 < references[1] <= 520 and references[1] < references[2] <= 1200
     assert build(geometry, "bvh2", builder="sbvh", split_alpha=1.0).stats.references == 400  # No overlap is as large as the root.
-    with refused("split_budget", "at most 8"):
+    with refused("split_budget", "0 to 8"):
         build(geometry, "bvh2", builder="sbvh", split_budget=9.0)
 
 
@@ -235,8 +235,8 @@ def test_sah_cost_by_hand():
 
 @pytest.mark.parametrize("options, message", [
     ({"builder": "guess"}, ("builder", "no builder 'guess'", None, None, "binned")),
-    ({"cost_traversal": -1.0}, ("cost_traversal", "finite")),
-    ({"cost_intersection": np.inf}, ("cost_intersection", "finite")), ({"max_leaf": 0}, ("max_leaf",)), ({"max_leaf": 65}, ("max_leaf",))])
+    ({"cost_traversal": -1.0}, ("cost_traversal",)),
+    ({"cost_intersection": np.inf}, ("cost_intersection",)), ({"max_leaf": 0}, ("max_leaf",)), ({"max_leaf": 65}, ("max_leaf",))])
 def test_invalid_options_are_refused(options, message):
     with refused(*message):
         build(icosphere(0), "bvh2", **options)

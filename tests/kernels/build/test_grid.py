@@ -6,7 +6,6 @@ import pytest
 
 from tests.cell_cases import CASES, assert_damage_is_refused, points_of, triangles
 from tests.refused import refused
-from wrt.accel.cells import grid as module
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
 
@@ -77,18 +76,6 @@ def test_as_many_cells_as_the_density_asks_for(density):
         assert 0.6 * density * 5000 <= n.prod() <= 1.001 * density * 5000
         size = np.array(layout.size)[n > 1]
         assert size.max() < 1.6 * size.min()
-
-
-def test_too_many_references_make_larger_cells_and_a_warning(monkeypatch):
-    geometry = triangles(np.random.default_rng(4).uniform(-1.0, 1.0, (2000, 3, 3)))
-    monkeypatch.setattr(module, "MAX_REFERENCES", 50_000)
-    with pytest.warns(RuntimeWarning, match="limited to .* 50000 references"):
-        grid = build(geometry, "grid")
-    assert 2000 < grid.stats.references <= 50_000
-    assert max(grid.data.n) > 1
-    monkeypatch.setattr(module, "MAX_CELLS", 1000)
-    with pytest.warns(RuntimeWarning, match="limited to 1000 cells"):
-        assert build(icosphere(4), "grid").stats.nodes <= 1000
 
 
 @pytest.mark.parametrize("density", [0.0, -1.0, 1e9, float("nan")])

@@ -8,7 +8,7 @@ import pytest
 from tests.kernel_tools import rounded
 from tests.kernels.build.test_bvh2 import CASES, geometry_of
 from tests.kernels.build.test_clip import polygon_in
-from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, triangles
+from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for
 from tests.refused import refused
 from wrt.accel.cells.common import bounds_of
 from wrt.accel.cells.trees import KdOptions
@@ -171,12 +171,3 @@ def test_options_change_no_answer(kind, options):
 def test_invalid_options_are_refused(options, message):
     with refused(*message):
         build(icosphere(0), "kdtree", **options)
-
-
-@pytest.mark.slow
-def test_a_million_equal_triangles():
-    corners = np.broadcast_to(np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.0], [0.0, 1.0, 0.2]], np.float32), (10**6, 3, 3))
-    accel = build(triangles(corners), "kdtree")
-    assert accel.stats.depth <= STACK_SIZE and accel.stats.references < 4 * 10**6
-    hits = accel.closest_hit([[0.3, 0.3, 2.0]], [[0.0, 0.0, -1.0]])
-    assert hits.prim_id[0] == 0

@@ -246,22 +246,6 @@ def test_geometry_counts_triangles_then_spheres() -> None:
         assert hits.t[:2].tolist() == [4.5, 4.75] and not hits.u[:2].any() and not hits.v[:2].any()
 
 
-def test_primitive_records_in_any_order() -> None:
-    spheres = np.array([[1.0, 2.0, 3.0, 0.5]], np.float32)
-    geometry = Geometry(BALL.vertices, BALL.faces, spheres)
-    order = np.random.default_rng(2).permutation(len(geometry)).astype(np.int32)
-    out = geometry.primitives(Units(spheres=True), order)
-    assert out.dtype == records(Primitive, 0).dtype and np.array_equal(out["prim_id"], order)
-    for row in out[::7]:
-        if row["prim_id"] < len(BALL.faces):
-            corners = BALL.vertices[BALL.faces[row["prim_id"]]]
-            assert np.array_equal([row["v0"], row["v1"], row["v2"]], corners)
-        else:  # a sphere is read from the surfaces
-            assert row["prim_id"] == len(BALL.faces)
-    plain = Geometry.of(BALL).primitives(Units())
-    assert np.array_equal(plain["v1"], BALL.vertices[BALL.faces[:, 1]])
-
-
 def test_bounds_are_those_of_the_units_to_the_last_bit() -> None:
     # The host pads boxes for builds, and the device pads boxes that bound t of a hit. If they differed, a hit could lie outside
     # of the box that leads to it.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import multiprocessing
 import pickle
 from copy import deepcopy
 from pathlib import Path
@@ -97,14 +96,6 @@ def test_a_structure_over_arrays_of_a_device_goes_through_pickle(saved: Path) ->
             same(after, build((2.0 * BALL.vertices, BALL.faces), "bvh2"))
 
 
-def test_a_scene_goes_through_pickle() -> None:
-    material = wrt.Material()
-    scene = wrt.Scene((wrt.Object(BALL, (material,)),), spheres=(wrt.Sphere((0.0, 0.0, 3.0), 1.0, material),))
-    before = build(scene)
-    hits = pickle.loads(pickle.dumps(before)).closest_hit(*rays())
-    assert np.array_equal(hits.object, before.closest_hit(*rays()).object) and set(hits.object) == {-1, 0, 1}
-
-
 def crowd(spheres: bool) -> wrt.Scene:
     """A joined object between instances of one mesh, two materials, and a sphere."""
     red, grey, ring = wrt.Material(albedo=(1.0, 0.0, 0.0)), wrt.Material(), torus()
@@ -139,16 +130,6 @@ def test_copies_with_their_scene(kind: str, accel: str, tmp_path: Path) -> None:
             assert getattr(hits, name).tobytes() == getattr(again, name).tobytes(), name
     if kind == "moved":
         after.move(object="ring", matrix=np.eye(4))
-
-
-def _hits_in_process(accel: object) -> bytes:
-    return accel.closest_hit(*rays()).t.tobytes()  # type: ignore[attr-defined]
-
-
-def test_structures_reach_spawned_processes() -> None:
-    accel = build([BALL])
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert pool.map(_hits_in_process, [accel]) == [_hits_in_process(accel)]
 
 
 @pytest.mark.parametrize("kind", ["scene", "geometry"])
@@ -279,21 +260,6 @@ def test_a_child_that_does_not_exist_leads_nowhere() -> None:
     nodes["first_1"][0] = 10**8
     with refused(what="does not exist"):
         check_binary(nodes, 1, 64)
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("name", ["octree", "grid"])
-def test_numbers_of_any_size_are_read_without_a_word(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "x.accel"
-    build(BALL, name).save(path)
-    arrays = arrays_in(path)
-    for key in arrays.keys() - {"header"}:
-        for value in (3.4e38, -3.4e38, np.inf, np.nan):
-            changed = arrays[key].copy()
-            changed.reshape(-1).view(np.float32)[:1] = value
-            rewritten(path, arrays | {key: changed})
-            with contextlib.suppress(InputError):
-                load_accel(path, BALL)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -7,6 +7,7 @@ import numpy as np
 
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.geometry import Geometry
+from wrt.accel.structures import require_between
 from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
@@ -14,6 +15,7 @@ from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.units.box import half_area
 
 MAX_LEAF = 64
+MAX_BUDGET = 8.0  # of spatial splits
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,8 @@ class BvhOptions(BinaryOptions):
     row: int = 1
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_leaf <= MAX_LEAF:
-            raise InputError(f"must be 1 to {MAX_LEAF}, got {self.max_leaf}", argument="max_leaf")
-        for name in ("cost_traversal", "cost_intersection", "split_alpha", "split_budget"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"must be finite and not negative, got {value}", argument=name)
+        require_between(max_leaf=(self.max_leaf, 1, MAX_LEAF), split_budget=(self.split_budget, 0.0, MAX_BUDGET),
+                        **{name: (getattr(self, name), 0.0, 1e30) for name in ("cost_traversal", "cost_intersection", "split_alpha")})
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from wrt.accel.bvh.builders import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_launches import launch_raw
 from wrt.core.device import load_kernel, record_dtype, records, start
-from wrt.core.errors import InputError
 from wrt.core.threads import run_growing
 from wrt.core.types import Kernel, WarpStruct
 from wrt.core.warp_private import Record, struct_record
@@ -17,8 +16,6 @@ from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.warp_private import fields_of
-
-MAX_BUDGET = 8.0  # of spatial splits
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
@@ -81,12 +78,10 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
 def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Build by binned SAH, with spatial splits where the sides of an object split overlap (Stich et al. 2009).
 
-    A primitive may be in several leaves. Raises InputError for a split_budget above MAX_BUDGET.
+    A primitive may be in several leaves.
     """
     from wrt.kernels.build.sbvh import share_space, split_references  # not at the top, because a start does not need it
 
-    if options.split_budget > MAX_BUDGET:
-        raise InputError(f"must be at most {MAX_BUDGET:g}, got {options.split_budget}", argument="split_budget")
     lo, hi = geometry.bounds(threads)
     n = len(lo)
     if n <= 1:

@@ -143,10 +143,3 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
     check_ranges(cells["first"], cells["count"], len(references))
     if ((references < 0) | (references >= n_primitives)).any():
         raise InputError("is damaged: a reference leads out of the primitives")
-
-
-def require_between(**options: tuple[float, float, float]) -> None:
-    """Raise InputError for an option whose value is out of range. options: name=(value, low, high)."""
-    for name, (value, low, high) in options.items():
-        if not low <= value <= high:
-            raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)

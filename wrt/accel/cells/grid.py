@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +9,10 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.bvh.builders import half_areas
-from wrt.accel.cells.common import check_references, require_between, shapes_of
+from wrt.accel.cells.common import check_references, shapes_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Built
+from wrt.accel.structures import require_between
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.types import WarpArray, WarpStruct
@@ -21,7 +21,6 @@ from wrt.kernels.traverse import grid as kernels
 from wrt.kernels.units.box import PAD_EXTENT
 
 MAX_CELLS = 1 << 25
-MAX_REFERENCES = 1 << 27
 MAX_AXIS = 2048
 PRIMITIVES_PER_LAUNCH = 16384
 
@@ -30,7 +29,8 @@ PRIMITIVES_PER_LAUNCH = 16384
 class GridOptions:
     """Options of the grid. Raises InputError for values out of range.
 
-    density: cells per primitive, 1e-3 to 1e3. mailbox: avoid testing a ray against the same primitive in several cells.
+    density: cells per primitive, 1e-3 to 1e3; there are at most MAX_CELLS. mailbox: avoid testing a ray against the same primitive in
+    several cells.
     """
 
     density: float = 2.0
@@ -43,8 +43,7 @@ class GridOptions:
 class Grid(OneMesh):
     """A uniform grid. Options: GridOptions.
 
-    If there would be more than MAX_CELLS cells or, by an estimate, more than MAX_REFERENCES references, the cells become larger, with
-    a RuntimeWarning. Every cell that overlaps a sphere's box lists the sphere. The option `box` has no effect.
+    Every cell that overlaps a sphere's box lists the sphere. The option `box` has no effect.
     """
 
     name = "grid"
@@ -82,21 +81,13 @@ def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
     layout = kernels.GridLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     extent = high.astype(np.float64) - low.astype(np.float64)
-    wanted = density * len(lo)
     n = np.ones(3, np.int64)
     if len(lo) and np.isfinite(extent).all():
         # `finest` keeps cells so large that the rounding of their planes does not matter.
         finest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64) * PAD_EXTENT
         with np.errstate(divide="ignore", invalid="ignore"):
             most = np.clip(np.where(extent > 0.0, extent / finest, 1.0), 1, MAX_AXIS)
-        n = cells_along(extent, most, min(wanted, MAX_CELLS))
-        fits = n
-        while fits.max() > 1 and references_bound(lo, hi, extent / fits) > MAX_REFERENCES:
-            fits = np.maximum(fits * 3 // 4, 1)
-        if wanted > MAX_CELLS or not np.array_equal(n, fits):
-            warnings.warn(f"the grid has {' x '.join(map(str, fits))} cells in place of about {wanted:.3g}, because it is limited to "
-                          f"{MAX_CELLS} cells and an estimate of {MAX_REFERENCES} references", RuntimeWarning, stacklevel=2)
-        n = fits
+        n = cells_along(extent, most, min(density * len(lo), MAX_CELLS))
     layout.lo, layout.hi, layout.n = wp.vec3(*low), wp.vec3(*high), wp.vec3i(*n.tolist())
     size = np.zeros(3, np.float32)
     size[n > 1] = (extent[n > 1] / n[n > 1]).astype(np.float32)
@@ -118,12 +109,6 @@ def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarr
             high = middle
     n = np.floor(along(low) + 1e-9).astype(np.int64)
     return np.maximum(n, 1)
-
-
-def references_bound(lo: np.ndarray, hi: np.ndarray, size: np.ndarray) -> float:
-    """Estimate the number of references: (ab + bc + ca) / 3 for a primitive whose box spans a x b x c cells of this size."""
-    a, b, c = (((hi.astype(np.float64) - lo) / np.maximum(size, 1e-300)) + 1.0).T
-    return float((a * b + b * c + c * a).sum()) / 3.0
 
 
 def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct,

@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
-from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, require_between, shapes_of
+from wrt.accel.cells.common import MAX_REFERENCES, bounds_of, build_tree, check_references, shapes_of
 from wrt.accel.snapshot import Built
 from wrt.accel.store import check_ranges, check_tree
-from wrt.core.checks import shown
+from wrt.accel.structures import require_between
 from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.core.types import WarpStruct
@@ -41,8 +41,6 @@ class KdOptions:
     max_growth: float = 16.0  # Limit of references and empty leaves per primitive.
 
     def __post_init__(self) -> None:
-        if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
-            raise InputError(f"must be int or None, got {shown(self.max_depth)}", argument="max_depth")
         require_between(max_leaf=(self.max_leaf, 1, MAX_IN_LEAF), max_depth=(self.max_depth or 0, 0, kernels.STACK_SIZE),
                         cost_traversal=(self.cost_traversal, 0.0, 1e6), cost_intersection=(self.cost_intersection, 0.0, 1e6),
                         empty_bonus=(self.empty_bonus, 0.0, 1.0), max_growth=(self.max_growth, 1.0, 1e4))
@@ -79,8 +77,7 @@ class KdTree(OneMesh):
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]
         leaf, first = (nodes["word"] & 3) == layouts.KD_LEAF, (nodes["word"] >> 2).astype(np.int64)
-        check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
-                   kernels.STACK_SIZE)
+        check_children(first[~leaf], np.full(int((~leaf).sum()), 3), np.flatnonzero(~leaf), len(nodes), kernels.STACK_SIZE)
         check_ranges(first[leaf], nodes["split"][leaf], len(built.order))
 
 

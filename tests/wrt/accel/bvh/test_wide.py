@@ -9,7 +9,7 @@ import pytest
 
 from tests.refused import refused
 from wrt.accel.bvh.compress import compress, decompress
-from wrt.accel.bvh.wide_tree import check_wide, lanes_of
+from wrt.accel.bvh.wide_tree import check_wide
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -97,18 +97,6 @@ def test_a_tree_too_deep_for_the_stack_is_refused() -> None:
     check_wide(chain(9), 9 * 8 - 8, 8)
     with refused(what="64 entries"):
         check_wide(chain(10), 10 * 8 - 9, 8)
-
-
-@pytest.mark.parametrize("width", [4, 8])
-def test_lanes_follow_the_leaves(width: int) -> None:
-    # Three leaves of 1, width + 1 and width primitives, at rows 0, 1 and 3.
-    children = np.array([[0, -1 - (64 + width), -1 - 0, -1 - (3 * 64 + width - 1)]], np.int32)
-    order = np.arange(10, 10 + 2 * width + 2, dtype=np.int32)
-    rows = lanes_of(children, order, width)
-    assert rows.shape == (4, width)
-    assert rows[0].tolist() == [10] + [-1] * (width - 1)
-    assert rows[1:3].reshape(-1).tolist() == order[1 : width + 2].tolist() + [-1] * (width - 1)
-    assert np.array_equal(rows[3], order[width + 2 :])
 
 
 @pytest.mark.parametrize("name", [*WIDE, "bvh6"])

@@ -10,7 +10,6 @@ import pytest
 import trimesh
 
 import wrt
-from tests.command_line import BOX_OBJ
 from tests.data import ROOT
 from tests.refused import Refusal, refused
 from wrt.accel.geometry import Geometry
@@ -60,24 +59,6 @@ def test_a_mesh_that_stands_in_many_places_is_kept_once() -> None:
     assert isinstance(accel, Instances) and len(accel.geometry) == 5 * len(big.faces)
     hits = accel.closest_hit([[9.0, 0.0, 5.0], [1.5, 0.0, 5.0]], [[0.0, 0.0, -1.0]] * 2)
     assert hits.object.tolist() == hits.instance.tolist() == [3, -1] and hits.material.tolist() == [1, -1]
-
-
-def test_a_structure_of_a_file_knows_the_mesh_it_is_over(tmp_path: Path) -> None:
-    wrt.build(BALL).save(tmp_path / "ball.accel")
-    asked = ORIGINS, DIRECTIONS - ORIGINS
-    read, built = wrt.load_accel(tmp_path / "ball.accel", BALL).closest_hit(*asked), wrt.build(BALL).closest_hit(*asked)
-    np.testing.assert_array_equal(read.shading_normal, built.shading_normal)
-    assert not np.array_equal(read.shading_normal, read.normal, equal_nan=True)
-
-
-def test_a_path_is_built_as_its_mesh_is(tmp_path: Path) -> None:
-    path = tmp_path / "box.obj"
-    path.write_text(BOX_OBJ)
-    o, d = np.random.default_rng(0).normal(size=(2, 200, 3)) * [[[5.0]], [[1.0]]]
-    expected = wrt.build(wrt.load_mesh(path), "brute_force").closest_hit(o, d)
-    assert 0 < (expected.prim_id >= 0).sum() < 200
-    for given in (path, str(path)):
-        assert np.array_equal(wrt.build(given).closest_hit(o, d).prim_id, expected.prim_id)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
