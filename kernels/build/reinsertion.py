@@ -11,6 +11,7 @@ from wrt.kernels.units.box import half_area
 
 QUEUE = 96
 QUEUE_SIZE = wp.constant(QUEUE)
+Six = wp.types.vector(6, wp.int32)
 
 
 @wp.struct
@@ -141,19 +142,17 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
             sibling = wp.where(links[parent].left == move.node, links[parent].right, links[parent].left)
             grandparent = links[parent].parent
             above = links[move.target].parent
-            taken = int(touched[move.node]) + int(touched[parent]) + int(touched[sibling]) + int(touched[move.target])
-            taken = taken + int(touched[grandparent]) + int(touched[above])
+            involved = Six(move.node, parent, sibling, move.target, grandparent, above)
+            taken = int(0)
+            for k in range(6):
+                taken += int(touched[involved[k]])
             # An earlier move may have put the target into the node's subtree: then i ends at move.node, else below 0.
             i = int(move.target)
             while i >= 0 and i != move.node:
                 i = links[i].parent
             if taken == 0 and i < 0 and move.target != parent and move.target != sibling:
-                touched[move.node] = wp.uint8(1)
-                touched[parent] = wp.uint8(1)
-                touched[sibling] = wp.uint8(1)
-                touched[move.target] = wp.uint8(1)
-                touched[grandparent] = wp.uint8(1)
-                touched[above] = wp.uint8(1)
+                for k in range(6):
+                    touched[involved[k]] = wp.uint8(1)
                 replace_child(links, grandparent, parent, sibling)
                 refit_up(links, areas, grandparent, scale)
                 above = links[move.target].parent

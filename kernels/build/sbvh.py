@@ -214,22 +214,19 @@ def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec
     done_1 = int(0)
     for i in range(task.begin, task.end):
         record = data.records[i]
-        to_left = bool(record.hi[split.axis] < plane)
-        to_right = bool(record.lo[split.axis] >= plane)
-        if not to_left and not to_right:
+        side = int(wp.where(record.hi[split.axis] < plane, -1, 1))  # as in cheaper_side
+        if side > 0 and record.lo[split.axis] < plane:
             part_0 = clip_reference(record, split.axis, -wp.inf, plane, data.corners)
             part_1 = clip_reference(record, split.axis, plane, wp.inf, data.corners)
-            to_left = is_empty(part_1)
-            to_right = is_empty(part_0) and not to_left
-            if not to_left and not to_right:
+            if is_empty(part_1):
+                side = -1
+            elif not is_empty(part_0):
                 box = row_of(record.lo, record.hi)
                 side = cheaper_side(parts, box, scale)
                 if side < 0:
-                    to_left = bool(True)
                     parts.left = lower(parts.left, box)
                     parts.n_right -= 1
                 elif side > 0:
-                    to_right = bool(True)
                     parts.right = lower(parts.right, box)
                     parts.n_left -= 1
                 elif done_0 + done_1 + 1 + task.end - i <= task.limit - task.begin:
@@ -238,11 +235,11 @@ def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec
                     done_1 = done_1 + 1
                     data.boxes[task.limit - done_1] = part_1
                 else:
-                    to_left = bool(True)
-        if to_left:
+                    side = -1
+        if side < 0:
             data.boxes[task.begin + done_0] = record
             done_0 = done_0 + 1
-        elif to_right:
+        elif side > 0:
             done_1 = done_1 + 1
             data.boxes[task.limit - done_1] = record
     return wp.vec2i(done_0, done_1)
@@ -252,27 +249,25 @@ def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec
 def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
     """Copy references to data.boxes as partition_by_plane does, but whole, by the bin of the centroid; return the numbers (left, right)."""
     n = task.end - task.begin
-    middle = task.begin + n / 2
+    bins = bins_of(task)
+    split = Split()
+    split.axis = -1
     if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
-        bins = bins_of(task)
         split = binned_split(data, task, bins)
+    done_0 = int(0)
+    done_1 = int(0)
+    for i in range(task.begin, task.end):
+        record = data.records[i]
+        left = bool(i < task.begin + n / 2)  # if no axis separates the centroids, or the tree gets too deep, halve the list
         if split.axis >= 0:
-            done_0 = int(0)
-            done_1 = int(0)
-            for i in range(task.begin, task.end):
-                record = data.records[i]
-                if bin_of(center_of(record), split.axis, bins) < split.bin:
-                    data.boxes[task.begin + done_0] = record
-                    done_0 = done_0 + 1
-                else:
-                    done_1 = done_1 + 1
-                    data.boxes[task.limit - done_1] = record
-            return wp.vec2i(done_0, done_1)
-    for i in range(task.begin, middle):
-        data.boxes[i] = data.records[i]
-    for i in range(middle, task.end):
-        data.boxes[task.limit - 1 - (i - middle)] = data.records[i]
-    return wp.vec2i(middle - task.begin, task.end - middle)
+            left = bin_of(center_of(record), split.axis, bins) < split.bin
+        if left:
+            data.boxes[task.begin + done_0] = record
+            done_0 = done_0 + 1
+        else:
+            done_1 = done_1 + 1
+            data.boxes[task.limit - done_1] = record
+    return wp.vec2i(done_0, done_1)
 
 
 @wp.func

@@ -34,12 +34,6 @@ def test_a_mesh_that_is_too_large_is_refused_with_a_way_out() -> None:
     assert len(build(icosphere(0), "bsp", max_triangles=20).geometry) == 20
 
 
-def test_progress_rises_to_one() -> None:
-    seen: list[float] = []
-    build(icosphere(3), "bsp", progress=seen.append)
-    assert len(seen) > 2 and seen == sorted(seen) and seen[-1] == 1.0
-
-
 def test_threads_change_nothing() -> None:
     one, two = (build(icosphere(4), "bsp", threads=threads).built for threads in (1, 2))  # more primitives than KEEP
     for name, array in one.arrays.items():
