@@ -102,11 +102,6 @@ def test_wrong_skins(tmp_path, change, message):
         load(file, tmp_path)
 
 
-def test_a_joint_that_is_not_there(tmp_path):
-    with refused(what="is 7, but there are 1 joints"):
-        load(skinned(joints=FIRST * 7), tmp_path)
-
-
 # --- morph targets ----------------------------------------------------------------------------------------------------
 
 

@@ -62,15 +62,6 @@ def test_transforms_multiply_along_the_path(tmp_path, seed):
     assert np.sign(np.linalg.det(inner.transform)) == np.sign(np.prod([a["scale"], b["scale"], c["scale"]]))
 
 
-def test_a_quarter_turn_and_a_mirror_by_hand(tmp_path):
-    file = GltfFile()
-    half = math.sqrt(0.5)
-    file.node(mesh=file.mesh(file.primitive()), translation=[1, 2, 3], rotation=[0, half, 0, half], scale=[-2, 1, 1])
-    transform = load(file, tmp_path).objects[0].transform
-    assert transform @ [1, 0, 0, 1] == pytest.approx([1, 2, 5, 1])  # x, mirrored to -2, turns from -x to +z
-    assert transform @ [0, 0, 1, 1] == pytest.approx([2, 2, 3, 1])  # z turns to x
-
-
 def test_the_default_scene_is_shown(tmp_path):
     file = GltfFile()
     mesh = file.mesh(file.primitive())
@@ -86,23 +77,13 @@ def test_the_default_scene_is_shown(tmp_path):
         load(file, tmp_path)
 
 
-def test_a_deep_chain_needs_no_recursion(tmp_path):
-    file = GltfFile()
-    file.node(mesh=file.mesh(file.primitive()))
-    for i in range(5000):
-        file.node(children=[i], translation=[1, 0, 0])
-    assert load(file, tmp_path).objects[0].transform[:3, 3] == pytest.approx([5000, 0, 0])
-
-
 @pytest.mark.parametrize("children, message", [
     ({0: [1], 1: [2], 2: [0]}, (None, "node graph", "nodes[0]")),
     ({0: [1], 2: [2]}, (None, "node graph", "nodes[2]")),
     ({0: [2], 1: [2]}, (None, "two parents", "nodes[1].children[0]")),
     ({0: [1, 1]}, (None, "two parents", "nodes[0].children[1]")),
     ({0: [7]}, (None, "7, but there", "nodes[0].children[0]")),
-    ({0: [-1]}, (None, "nodes", "nodes[0].children[0]")),
     ({0: [0.5]}, (None, "integer", "nodes[0].children[0]")),
-    ({0: 1}, (None, "array", "nodes[0].children")),
 ])
 def test_graphs_that_are_no_forest(tmp_path, children, message):
     file = GltfFile()
@@ -112,24 +93,12 @@ def test_graphs_that_are_no_forest(tmp_path, children, message):
         load(file, tmp_path)
 
 
-def test_a_node_that_the_scene_reaches_twice(tmp_path):
-    file = one_triangle()
-    file.json["scenes"] = [{"nodes": [0, 0]}]
-    with refused(what="scene twice", place="scenes[0].nodes[1]"):
-        load(file, tmp_path)
-
-
 @pytest.mark.parametrize("fields, message", [
     ({"matrix": [1.0] * 15}, (None, "hold 16 numbers", "nodes[0].matrix")),
     ({"matrix": [1.0] * 16}, ("it", "affine", "nodes[0].matrix")),
-    ({"scale": [1, 1]}, (None, "hold 3 numbers", "nodes[0].scale")),
     ({"scale": [1, "1", 1]}, (None, "number", "nodes[0].scale[1]")),
     ({"rotation": [0, 0, 0, 0]}, (None, "unit quaternion", "nodes[0].rotation")),
-    ({"translation": [1e400, 0, 0]}, (None, "finite number", "nodes[0].translation[0]")),
     ({"mesh": 3}, (None, "3, but there", "nodes[0].mesh")),
-    ({"mesh": True}, (None, "integer", "nodes[0].mesh")),
-    ({"camera": 0}, (None, "0, but there", "nodes[0].camera")),
-    ({"extensions": []}, (None, "object", "nodes[0].extensions")),
 ])
 def test_wrong_nodes(tmp_path, fields, message):
     file = one_triangle()
@@ -138,34 +107,11 @@ def test_wrong_nodes(tmp_path, fields, message):
         load(file, tmp_path)
 
 
-def test_a_product_that_overflows(tmp_path):
-    file = one_triangle()
-    file.json["nodes"][0]["scale"] = [1e200] * 3
-    file.node(children=[0], scale=[1e200] * 3)
-    with refused("transform", "finite 4x4 matrix", place="nodes[0]: object 'place'"):
-        load(file, tmp_path)
-
-
-@pytest.mark.parametrize("fields", [{"scale": [1e19, 1, 1]}, {"translation": [0, -2e18, 0]}])
-def test_a_mesh_out_of_reach(tmp_path, fields):
-    file = one_triangle()
-    file.json["nodes"][0].update(fields)
-    with refused(what="reaches", place="nodes[0]: object 'place'"):
-        load(file, tmp_path)
-
-
 def test_a_rotation_may_have_any_length(tmp_path):
     for length in (1e-200, 1e-30, 1.0, 1e200):
         file = one_triangle()
         file.json["nodes"][0]["rotation"] = [0, 0, length, length]
         assert load(file, tmp_path).objects[0].transform @ [1, 0, 0, 1] == pytest.approx([0, 1, 0, 1])
-
-
-def test_a_mesh_scaled_to_nothing_is_named(tmp_path):
-    file = one_triangle()
-    file.json["nodes"][0]["scale"] = [1, 0, 1]
-    with refused(what="meshes scaled"):
-        load(file, tmp_path)
 
 
 # --- triangles --------------------------------------------------------------------------------------------------------
@@ -204,13 +150,6 @@ def test_fans_face_one_way(tmp_path, count):
     assert 0.5 * face_normals(mesh)[:, 2].sum() == pytest.approx(area, abs=1e-6)
 
 
-@pytest.mark.parametrize("mode", [4, 5, 6])
-def test_too_few_points_make_no_triangle(tmp_path, mode):
-    message = (None, "primitives without a triangle")
-    with refused(*message):
-        load(one_triangle(vertices=TRIANGLE[:2], mode=mode), tmp_path)
-
-
 def test_points_and_lines_are_named_once(tmp_path):
     file = GltfFile()
     file.node(mesh=file.mesh(*(file.primitive(mode=mode) for mode in range(5)), name="mixed"))
@@ -223,20 +162,6 @@ def test_an_incomplete_last_triangle_is_named(tmp_path):
     path = one_triangle(vertices=SQUARE, indices=[0, 1, 2, 0, 2]).write(tmp_path)
     scene, messages = load_warned(path, staged=False)
     assert len(scene.objects[0].mesh.faces) == 1 and "incomplete last triangles (mesh 'thing')" in messages[0]
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
-def test_index_types(tmp_path, dtype):
-    file = one_triangle(vertices=SQUARE)
-    file.json["meshes"][0]["primitives"][0]["indices"] = file.accessor([0, 1, 2, 0, 2, 3], dtype)
-    assert load(file, tmp_path).objects[0].mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-
-
-def test_degenerate_faces_and_unused_vertices_are_dropped_and_counted(tmp_path):
-    vertices = np.vstack([SQUARE, [[2, 0, 0], [9, 9, 9]]])
-    mesh = load(one_triangle(vertices=vertices, indices=[0, 1, 2, 0, 1, 1, 0, 1, 4, 0, 2, 3]), tmp_path).objects[0].mesh
-    assert mesh.dropped == 2 and np.array_equal(mesh.vertices, SQUARE)
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
 def test_attributes(tmp_path):
@@ -295,24 +220,11 @@ def test_instances_share_a_mesh_and_follow_their_node(tmp_path):
         assert thing.transform == pytest.approx(matrix_of(parent) @ matrix_of(item), rel=1e-5, abs=1e-5)
 
 
-def test_instances_with_translations_alone_and_rotations_as_bytes(tmp_path):
-    file = one_triangle()
-    quarter = np.array([[0, 0, 90, 90], [0, 0, 0, 127]])
-    file.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {
-        "TRANSLATION": file.accessor([[1, 0, 0], [2, 0, 0]]),
-        "ROTATION": file.accessor(quarter, "int8", normalized=True)}}}
-    first, second = load(file, tmp_path).objects
-    assert first.transform @ [1, 0, 0, 1] == pytest.approx([1, 1, 0, 1])
-    assert second.transform @ [1, 0, 0, 1] == pytest.approx([3, 0, 0, 1])
-
-
 @pytest.mark.parametrize("attributes, message", [
     ({}, (None, "hold accessors", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes")),
     ({"TRANSLATION": 1, "SCALE": 2}, (None, "hold accessors", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes")),
     ({"TRANSLATION": 3}, (None, "type VEC3", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.TRANSLATION")),
     ({"ROTATION": 3}, (None, "quaternions", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.ROTATION")),
-    ({"SCALE": 9}, (None, "9, but there", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.SCALE")),
-    ({"SCALE": "x"}, (None, "integer", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.SCALE")),
 ])
 def test_wrong_instances(tmp_path, attributes, message):
     file = one_triangle()
@@ -326,20 +238,15 @@ def test_wrong_instances(tmp_path, attributes, message):
 @pytest.mark.parametrize("change, message", [
     (lambda f, p: p.update(indices=f.accessor([0, 1, 3], "uint16")),
      (None, "index 2 is 3", "meshes[0].primitives[0].indices")),
-    (lambda f, p: p.update(indices=f.accessor([0, 1, 2])), (None, "unsigned", "meshes[0].primitives[0].indices")),
     (lambda f, p: p.update(indices=f.accessor([0, 1, 2], "int16")), (None, "unsigned", "meshes[0].primitives[0].indices")),
-    (lambda f, p: p.update(indices=5), (None, "5, but there", "meshes[0].primitives[0].indices")),
     (lambda f, p: p.update(mode=9), (None, "0 to 6", "meshes[0].primitives[0].mode")),
     (lambda f, p: p.update(material=2), (None, "2, but there", "meshes[0].primitives[0].material")),
     (lambda f, p: p.update(attributes="POSITION"), (None, "object", "meshes[0].primitives[0].attributes")),
-    (lambda f, p: p["attributes"].update(POSITION="0"), (None, "integer", "meshes[0].primitives[0].attributes.POSITION")),
-    (lambda f, p: p["attributes"].update(POSITION=4), (None, "4, but", "meshes[0].primitives[0].attributes.POSITION")),
     (lambda f, p: p["attributes"].update(POSITION=f.accessor([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])),
      (None, "element 1", "meshes[0].primitives[0].attributes.POSITION: accessors[1]")),
     (lambda f, p: f.json["accessors"][0].update(count=4),
      (None, "4 elements reach", "meshes[0].primitives[0].attributes.POSITION: accessors[0]")),
     (lambda f, p: f.json.update(meshes={}), (None, "array", "meshes")),
-    (lambda f, p: f.json["meshes"].insert(0, None), (None, "object", "meshes[0]")),
 ])
 def test_wrong_primitives(tmp_path, change, message):
     file = one_triangle()
@@ -380,12 +287,10 @@ def test_an_orthographic_camera_is_as_high_as_its_ymag_says(tmp_path):
 @pytest.mark.parametrize("camera, message", [
     ({"type": "perspective"}, (None, "'perspective'", "cameras[0].type")),
     ({"type": "fisheye"}, (None, "'perspective'", "cameras[0].type")),
-    ({}, (None, "required", "cameras[0].type")),
     ({"type": "perspective", "perspective": {}}, (None, "required", "cameras[0].perspective.yfov")),
     ({"type": "orthographic", "orthographic": {"ymag": 1}}, (None, "required", "cameras[0].orthographic.xmag")),
     ({"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 0}}, ("height", "", "nodes[1].camera: camera 'camera 0'")),
     ({"type": "perspective", "perspective": {"yfov": 4}}, ("fov_y", "", "nodes[1].camera: camera 'camera 0'")),
-    ({"type": "perspective", "perspective": {"yfov": "wide"}}, (None, "number", "cameras[0].perspective.yfov")),
 ])
 def test_wrong_cameras(tmp_path, camera, message):
     file = one_triangle()
@@ -407,13 +312,6 @@ def test_lights(tmp_path):
     spot = load(with_light({"type": "spot", "spot": cone, **tint}, **pose), tmp_path).lights[0]
     assert isinstance(spot, SpotLight) and spot.position == (1, 2, 3) and spot.intensity == (4, 2, 1)
     assert spot.direction == pytest.approx((0, -1, 0)) and (spot.inner, spot.outer) == (0.2, 0.5)
-
-
-def test_light_defaults_and_range(tmp_path):
-    scene, messages = load_warned(with_light({"type": "spot", "range": 5}, name="torch").write(tmp_path), staged=False)
-    spot = scene.lights[0]
-    assert spot.intensity == (1, 1, 1) and spot.inner == 0 and spot.outer == pytest.approx(math.pi / 4)
-    assert len(messages) == 1 and "range (light 'torch')" in messages[0]
 
 
 @pytest.mark.parametrize("light, message", [
@@ -470,13 +368,6 @@ def test_what_a_mesh_does_not_need_cannot_refuse_it(tmp_path):
         assert len(scene.objects) == 1 and (attribute == "TANGENT" or problem in messages[0])
     for found in (scene.objects[0].mesh.normals, scene.objects[0].mesh.uvs):
         assert found is None
-
-
-def test_normals_that_are_no_numbers_are_zero(tmp_path):
-    file = one_triangle()
-    file.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = file.accessor([[np.nan, 0, 1], [0, 0, 2], [0, np.inf, 0]])
-    scene, _ = load_warned(file.write(tmp_path), staged=False)
-    assert scene.objects[0].mesh.normals.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
 
 
 def test_a_position_that_no_triangle_uses_may_be_anything(tmp_path):
