@@ -8,8 +8,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
-from wrt.io.mesh_file import RawMesh
-from wrt.io.polygons import triangulate
+from wrt.io.mesh_file import RawMesh, triangulate
 
 
 def read(path: Path) -> RawMesh:

@@ -3,7 +3,6 @@
 A new file is written beside its target and renamed to it, so that a link at the target is replaced and never followed. A killed process
 leaves its temporary file, `.wrt-*` (docs/long_renders.md)."""
 
-import codecs
 import contextlib
 import json
 import os
@@ -39,13 +38,6 @@ def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
             raise InputError("cannot be read: it is no regular file")
         with open(path, "rb") as file:
             return file.read(most)
-
-
-def utf8(text: bytes) -> bytes:
-    """Return a text file's bytes without a byte order mark. Raises InputError, without the path, for text in UTF-16 or UTF-32."""
-    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
-        raise InputError("is text in UTF-16 or UTF-32", hint="save it as UTF-8")
-    return text.removeprefix(codecs.BOM_UTF8)
 
 
 def checksum_of(*arrays: "np.ndarray") -> int:

@@ -50,20 +50,19 @@ def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: boo
     """
     staging = Staging(up, studio, floor, fill)
     path = as_path(path, "path")
-    known = ", ".join([*LOADERS, *MESH_FORMATS])
+    suffix, known = path.suffix.lower(), ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
-    if path.is_dir():
-        raise InputError(f"is a directory, not a scene file ({known})", path=path)
-    load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
-    if load is None:
+    if suffix not in LOADERS and suffix not in MESH_FORMATS:
         raise InputError(f"is no scene file: its suffix must be one of {known}", path=path)
-    if load is not _load_bare_mesh and (up != "y" or floor):
+    if suffix in LOADERS and (up != "y" or floor):
         raise InputError("is for mesh files alone: a scene file says what is up and what is below", argument="up" if up != "y" else "floor",
                          path=path)
-    if fill is not None and path.suffix.lower() not in (".gltf", ".glb"):
+    if fill is not None and suffix not in (".gltf", ".glb"):
         raise InputError("is for glTF files alone", argument="fill", path=path, hint="a TOML scene has `ambient`")
     with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
-        return load(path, staging)
+        if suffix in LOADERS:
+            return LOADERS[suffix](path, staging)
+        return _bare(load_mesh(path), path.stem, path, staging)
 
 
 def as_scene(value: Scene | Mesh | PathLike) -> Scene:
@@ -89,10 +88,6 @@ def _load_toml(path: Path, staging: Staging) -> Scene:
     from wrt.io.toml.report import check
 
     return _staged(build(check(_parse(path), path), path), path, staging)
-
-
-def _load_bare_mesh(path: Path, staging: Staging) -> Scene:
-    return _bare(load_mesh(path), path.stem, path, staging)
 
 
 def _bare(mesh: Mesh, name: str, path: PathLike, staging: Staging) -> Scene:

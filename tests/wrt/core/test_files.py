@@ -18,7 +18,7 @@ from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.accel.scenes.build import build, load_accel
 from wrt.cli.reporting import Reporting
 from wrt.core.errors import InputError
-from wrt.core.files import check_writable, read_file, replacing, utf8
+from wrt.core.files import check_writable, read_file, replacing
 from wrt.io.load import load_scene
 from wrt.picture.image import read_image, write_codes, write_image
 from wrt.renderer.animate import save_movie
@@ -47,13 +47,6 @@ def test_bytes_come_whole(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\0\1\r\n" * 1000)
     (tmp_path / "link").symlink_to(tmp_path / "a")
     assert read_file(tmp_path / "a") == read_file(tmp_path / "link") == b"\0\1\r\n" * 1000 and read_file(tmp_path / "a", 3) == b"\0\1\r"
-
-
-def test_only_utf8_with_or_without_its_mark_is_read() -> None:
-    assert utf8("v é".encode("utf-8-sig")) == utf8("v é".encode()) == "v é".encode()
-    for encoding in ("utf-16", "utf-32"):
-        with refused(what="UTF-16", hint="UTF-8"):
-            utf8("v é".encode(encoding))
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", ".", "a\0b", "nowhere", "x" * 5000, "/proc/self/mem/x"])

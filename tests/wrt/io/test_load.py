@@ -431,8 +431,9 @@ def test_files_that_are_not_toml(tmp_path: Path, data: bytes, place: str | None)
 def test_paths_that_are_no_scene(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "a.blend").write_text("")
-    for name in ("none.toml", "folder.toml", "a.blend", "none"):
-        with refused(None, ".toml, .gltf, .glb, .npz, .obj, .off, .ply, .stl", path=name):
+    formats = ".toml, .gltf, .glb, .npz, .obj, .off, .ply, .stl"
+    for name, what in (("none.toml", formats), ("folder.toml", "no regular file"), ("a.blend", formats), ("none", formats)):
+        with refused(None, what, path=name):
             load_scene(tmp_path / name)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wrt.io.polygons import triangulate
+from wrt.io.mesh_file import triangulate
 
 
 def area_vectors(points: np.ndarray) -> np.ndarray:

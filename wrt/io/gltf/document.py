@@ -1,7 +1,8 @@
-"""A glTF 2.0 file: the container (.gltf, .glb), its JSON, its buffers and the files that it refers to.
+"""A glTF 2.0 file: the container (.gltf, .glb), its JSON, its buffers and accessors, and the files that it refers to.
 
-Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB); EXT_meshopt_compression and
-KHR_meshopt_compression. A file that does not require these two has plain buffers, which wrt reads instead.
+Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers, accessors) and 4 (GLB); KHR_mesh_quantization for integer
+positions; EXT_meshopt_compression and KHR_meshopt_compression. A file that does not require these two has plain buffers, which wrt reads
+instead.
 """
 
 import base64
@@ -26,6 +27,10 @@ GLB_MAGIC = b"glTF"
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 MESHOPT = ("KHR_meshopt_compression", "EXT_meshopt_compression")
 _MOST = 1024  # bytes for which one byte of meshopt's data can stand: four columns of a block of 256 vertices, if all are 0
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_MAX_COUNT = 2**31 - 1
+_MAX_IMPLICIT_COUNT = 2**22  # elements without a buffer, which are zeros: a file of a few bytes must not fill the memory
 
 SUPPORTED_EXTENSIONS = frozenset({*EXTENSIONS, "KHR_mesh_quantization"})
 # Extensions that describe the file or its use, and change no pixel.
@@ -175,6 +180,103 @@ class Document:
                 raise InputError(f"is a data: URI that cannot be decoded: {error}", place=place) from None
         with at(f"{place}: {short(uri)}"):
             return read_file(self.path.parent / _local_name(uri))
+
+
+class Accessors:
+    """Reader of a document's accessors. Each accessor is decoded once, into a read-only array that all callers share."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._arrays: dict[int, np.ndarray] = {}
+
+    def read(self, index: int, kind: str, place: str, finite: bool = True) -> np.ndarray:
+        """Return accessor `index` as an array (count, components of `kind`): float32 for floats and normalised integers, else integers.
+
+        kind: "SCALAR", "VEC2", "VEC3", "VEC4" or "MAT4". Raises InputError at `place` if the accessor has another kind, does not fit into
+        its buffer view, or, if `finite`, holds a float that is not finite."""
+        accessor, where = self._document.item("accessors", index, place), f"accessors[{index}]"
+        if accessor.type != kind:
+            raise InputError(f"must be of type {kind}, but {where} is {short(accessor.type)}", place=place)
+        with at(place):
+            if index not in self._arrays:
+                self._put(index, self._decode(accessor, where), accessor, where)
+            if finite:
+                require_finite(self._arrays[index], where)
+        return self._arrays[index]
+
+    def put(self, index: int, values: np.ndarray, place: str) -> None:
+        """Set the array of accessor `index`, (count, components), which a compressed mesh holds. Raises InputError if it does not fit."""
+        accessor = self._document.item("accessors", index, place)
+        shape = accessor.count, _WIDTHS.get(accessor.type)
+        if values.shape != shape:
+            raise InputError(f"decodes to {values.shape} numbers, but accessors[{index}] has {shape}", place=place)
+        self._put(index, values.copy(), accessor, f"accessors[{index}]")
+
+    def _put(self, index: int, array: np.ndarray, accessor: GltfObject, where: str) -> None:
+        """Keep the array of an accessor. Normalised: 8- and 16-bit integers become float32 in [0, 1] or [-1, 1] by the specification's
+        table, which clamps the most negative value."""
+        if accessor.normalized:
+            if array.dtype.kind == "f" or array.dtype.itemsize > 2:
+                raise InputError("only 8- and 16-bit integers can be normalised", place=f"{where}.normalized")
+            array = np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))
+        array.flags.writeable = False
+        self._arrays[index] = array
+
+    def _decode(self, accessor: GltfObject, where: str) -> np.ndarray:
+        dtype, count = _dtype(accessor.componentType, where), accessor.count
+        most = _MAX_COUNT if accessor.bufferView is not None else _MAX_IMPLICIT_COUNT
+        if not 1 <= count <= most:
+            raise InputError(f"must be 1 to {most}, got {count}", place=f"{where}.count")
+        shape = (count, _WIDTHS[accessor.type])
+        if accessor.bufferView is not None:
+            array = self._elements(accessor.bufferView, accessor.byteOffset, dtype, shape, where)
+        else:  # zeros, by the specification
+            array = np.zeros(shape, dtype)
+        return array if accessor.sparse is None else self._with_sparse(array, accessor.sparse, f"{where}.sparse")
+
+    def _elements(self, view: int, offset: int, dtype: np.dtype, shape: tuple[int, int], where: str) -> np.ndarray:
+        """Return elements of a buffer view, which may be unaligned, as a packed array of `shape`."""
+        data, stride = self._document.view(view, f"{where}.bufferView")
+        size = dtype.itemsize * shape[1]
+        stride = stride or size
+        if stride < size:
+            raise InputError(f"is {stride} bytes, but an element has {size}", place=f"bufferViews[{view}].byteStride")
+        end = offset + (shape[0] - 1) * stride + size
+        if offset < 0 or end > len(data):
+            raise InputError(f"{shape[0]} elements reach from byte {offset} to {end} of bufferViews[{view}], "
+                             f"which has {len(data)} bytes", place=where)
+        elements = np.ndarray(shape, dtype, data.data, offset, (stride, dtype.itemsize))
+        return elements.astype(dtype.newbyteorder("="))
+
+    def _with_sparse(self, array: np.ndarray, sparse: GltfObject, where: str) -> np.ndarray:
+        """Replace the elements of `array` that the sparse accessor lists."""
+        if not 1 <= sparse.count <= len(array):
+            raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", place=f"{where}.count")
+        index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
+        if index_type.kind != "u":
+            raise InputError("must be an unsigned integer type", place=f"{where}.indices.componentType")
+        rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset, index_type, (sparse.count, 1),
+                              f"{where}.indices")[:, 0]
+        if rows.max() >= len(array):
+            raise InputError(f"holds the index {int(rows.max())}, but there are {len(array)} elements", place=f"{where}.indices")
+        values = sparse.values
+        array[rows] = self._elements(values.bufferView, values.byteOffset, array.dtype.newbyteorder("<"),
+                                     (sparse.count, array.shape[1]), f"{where}.values")
+        return array
+
+
+def require_finite(array: np.ndarray, where: str, rows: np.ndarray | None = None) -> None:
+    """Raise InputError, with the first wrong row, unless the elements of an array, or only its `rows`, are finite."""
+    bad = ~np.isfinite(array).all(axis=1)
+    wrong = np.flatnonzero(bad) if rows is None else np.unique(rows[bad[rows]])
+    if len(wrong):
+        raise InputError(f"must be finite, but element {wrong[0]} is {array[wrong[0]].tolist()} ({len(wrong)} such elements)", place=where)
+
+
+def _dtype(component_type: int, where: str) -> np.dtype:
+    if component_type not in _DTYPES:
+        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}", place=f"{where}.componentType")
+    return np.dtype(_DTYPES[component_type])
 
 
 def _decode_meshopt(data: np.ndarray, view: GltfObject, length: int, place: str) -> np.ndarray:

@@ -18,8 +18,7 @@ from wrt.core.errors import InputError, at, warn
 from wrt.core.types import PathLike
 from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.materials import Materials
-from wrt.io.gltf.meshes import Meshes
-from wrt.io.gltf.nodes import walk
+from wrt.io.gltf.meshes import Meshes, walk
 from wrt.io.gltf.schema import LIGHT, LIGHTS, read
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.defaults import Staging, add_fill, expose, is_lit, stage

@@ -18,8 +18,7 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError, warn
 from wrt.core.files import read_file
-from wrt.io.mesh_file import COMMENT, RawMesh, extend
-from wrt.io.polygons import triangulate
+from wrt.io.mesh_file import COMMENT, RawMesh, extend, triangulate
 from wrt.scene.mesh import corner_normals
 from wrt.scene.values import near_zero
 

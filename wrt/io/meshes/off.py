@@ -10,8 +10,7 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.io.mesh_file import COMMENT, RawMesh, as_number
-from wrt.io.polygons import triangulate
+from wrt.io.mesh_file import COMMENT, RawMesh, as_number, triangulate
 
 T = TypeVar("T", int, float)
 Row: TypeAlias = tuple[int, list[str]]  # number of a line, and its words

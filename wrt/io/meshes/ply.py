@@ -15,8 +15,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
-from wrt.io.mesh_file import RawMesh, extend
-from wrt.io.polygons import strip, triangulate
+from wrt.io.mesh_file import RawMesh, extend, strip, triangulate
 from wrt.scene.values import near_zero
 
 _TYPES = {

@@ -9,8 +9,7 @@ import pytest
 
 from tests.gltf_files import COMPONENT, KIND, GltfFile, load_warned, one_triangle
 from tests.refused import refused
-from wrt.io.gltf.accessors import Accessors
-from wrt.io.gltf.document import Document
+from wrt.io.gltf.document import Accessors, Document
 
 
 def read(file: GltfFile, folder: Path, kind: str, index: int = 0) -> np.ndarray:
