@@ -16,6 +16,7 @@ import wrt
 from wrt.lab.bench import error
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.report import run
 from wrt.lab.oracle.oracle import closest, t_bound
 from wrt.picture.heatmap import colored
 
@@ -45,13 +46,12 @@ wrt.side_by_side({**pictures, **errors}, columns=3)
 
 # %% [markdown]
 # ## How fast does the error fall?
-# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples per pixel and several seeds, and compares the pictures with a reference.
+# `wrt bench error` renders with 1, 2, 4 ... samples per pixel and several seeds, and compares the pictures with a reference.
 # The seeds give error bars. They also separate noise, which differs between seeds, from bias, which does not. The sweep covers both
 # samplers: independent random numbers, and scrambled Sobol points, which are spread evenly.
 
 # %%
-small = room.with_settings(size=SMALL)
-sweep = error.sweep(small, error.Plan(("sampler",), max_spp=MOST, repeats=REPEATS, reference_spp=4 * MOST), wrt.Options())
+sweep = run(error.Plan(room, size=SMALL, knobs=("sampler",), max_spp=MOST, repeats=REPEATS, reference_spp=4 * MOST))
 sweep
 
 # %%
@@ -69,7 +69,7 @@ def axes():
 
 ax = axes()
 for label, name in {"as it is": "sobol (the default)", "sampler = independent": "independent"}.items():
-    rows = [row for row in sweep.rows if row.variant == label]
+    rows = [row for row in error.pictures_of(sweep) if row.variant == label]
     rmse = np.array([row.rmse.value for row in rows])
     bars = np.abs(np.array([(row.rmse.low, row.rmse.high) for row in rows]).T - rmse)
     ax.errorbar([row.spp for row in rows], rmse, bars, fmt="o-", capsize=3, label=name)
@@ -77,7 +77,7 @@ n = np.array([1.0, MOST])
 ax.plot(n, rmse[0] / n**0.5, "k:", linewidth=1, label="one over the square root of the samples")
 ax.legend()
 plt.show()
-for slope in sweep.slopes:
+for slope in error.slopes(sweep):
     print(f"{slope.variant:22} squared error falls as the samples to the power {slope.mse.value:.2f}; theory: {slope.theory}")
 
 # %% [markdown]
@@ -124,8 +124,8 @@ for target in (0.1, 0.05) if QUICK else (0.04, 0.02, 0.01):
 # %%
 ax = axes()
 for depth in (4, 1, 0):
-    films = [wrt.render(small, spp=spp, max_depth=depth) for spp in LEVELS]
-    rmse = [np.sqrt(np.mean((film.pixels - sweep.reference.pixels) ** 2)) for film in films]
+    films = [wrt.render(room, size=SMALL, spp=spp, max_depth=depth) for spp in LEVELS]
+    rmse = [np.sqrt(np.mean((film.pixels - sweep[0].pixels) ** 2)) for film in films]
     label = f"max_depth {depth}: {films[-1].stats['rays_per_sample']:.2f} rays a sample"
     ax.plot(LEVELS, rmse, {0: "s--", 1: "o-", 4: "-"}[depth], linewidth=6 if depth == 4 else 1.5, label=label)
 ax.legend()
@@ -177,7 +177,7 @@ plt.show()
 # -1.5.
 # </details>
 #
-# **2.** `error.KNOBS` names the settings that `sweep` can vary. Which of them do not change this scene's pixels (`sweep.same_pixels`)?
+# **2.** `error.KNOBS` names the settings that can vary. Which of them do not change this scene's pixels (`error.same_pixels(sweep)`)?
 # <details><summary>Solution</summary>
 #
 # The structure (`accel`) and the box test never change a bit. `max_depth` of 1 or more and `min_throughput` change nothing here, because

@@ -42,7 +42,7 @@ CHEAP = {
     "bench queries": ("--number", "200", "--runs", "1", "--worlds", "2"),
 }
 SLOW = {  # run by `pytest -m slow`
-    "bench": (), "whatif": ("--rays", "200", "--kinds", "primary"),
+    "whatif": ("--rays", "200", "--kinds", "primary"),
     "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench rtcore": ("--rays", "500",),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
     "bench visibility": ("--size", "64", "--max-size", "64", "--max-triangles", "2000", "--runs", "1"),

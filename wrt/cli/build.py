@@ -5,18 +5,19 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import Assignments, Setting, load, naming, progress_writer, say, say_json, shared, values_of, warnings_reported
+from wrt.cli.common import Assignments, Parsed, load, naming, say, say_json, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
-SLOW = 1.0  # seconds after which a build reports its progress
+EVERY = 10.0  # seconds between two lines of progress
 
 
 @click.command(help="Build an acceleration structure over MESH, and save both."
                     f" MESH is {SUFFIXES}. wrt.load_accel reads the file.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write, with the suffix .accel")
-@click.option("--set", "assignments", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
+@click.option("--set", "assignments", metavar="NAME=VALUE", multiple=True,
+              help="An option of the structure, such as max_leaf=8; repeatable")
 @shared("accel", "threads", "quiet", "as_json")
 def build(mesh: Path, output: Path, accel: str, assignments: Assignments, threads: int | None, quiet: bool,
           as_json: bool) -> None:
@@ -25,14 +26,18 @@ def build(mesh: Path, output: Path, accel: str, assignments: Assignments, thread
     import wrt
     from wrt.accel.instances import Instances
     from wrt.accel.store import check_target
+    from wrt.core.checks import assigned
 
     check_target(output)
-    options = values_of(assignments, mesh="MESH", accel="--accel", device="the CPU", threads="--threads", progress="-q")
-    write, begin = progress_writer(quiet), time.monotonic()
+    options: dict[str, Parsed] = dict(assigned(assignments, "--set", {
+        "mesh": "MESH", "accel": "--accel", "device": "the CPU", "threads": "--threads", "progress": "-q"}))
+    due = time.monotonic() + EVERY
 
     def progress(done: float) -> None:
-        if time.monotonic() - begin > SLOW:
-            write(f"{accel}: {100.0 * done:.0f} % built")
+        nonlocal due
+        if not quiet and time.monotonic() > due:
+            due += EVERY
+            say(f"{accel}: {100.0 * done:.0f} % built")
 
     with warnings_reported(quiet):
         structure = wrt.build(mesh, accel, threads=threads, progress=progress, **options)

@@ -1,17 +1,13 @@
 """Parts that the commands share: types of options, loading of scenes, and output."""
 
-import ast
 import contextlib
-import dataclasses
 import functools
 import importlib
 import json
 import math
 import re
-import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
 
 Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
 Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
-Assignments: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The names and values of all --set options.
+Assignments: TypeAlias = tuple[str, ...]  # The texts NAME=VALUE of all --set options.
 BROKEN_PIPE = 141  # Exit code: 128 plus the number of SIGPIPE, which Windows does not have.
 DIGITS = "[0-9]{1,9}"  # A pixel coordinate. Longer numbers are an error, as Python refuses thousands of digits.
 
@@ -73,7 +69,7 @@ class Names(click.ParamType):
 
 
 class Commands(click.Group):
-    """A group of commands that suggests a similar option for an unknown option. It compares the names without their dashes."""
+    """A group of commands whose help leaves out the broken entry points of other packages, with a warning."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         with warnings_reported(False):
@@ -82,13 +78,6 @@ class Commands(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         try:
             return super().invoke(ctx)
-        except click.NoSuchOption as error:
-            from wrt.core.checks import most_similar
-
-            known = {name.strip("-") for each in error.ctx.command.params for name in each.opts} if error.ctx else set()
-            near = most_similar({"--width": "size", "--height": "size"}.get(error.option_name, error.option_name.strip("-")), known)
-            hint = f" Did you mean '--{near}'?" if near else ""
-            raise click.UsageError(f"No such option {error.option_name!r}.{hint}", error.ctx) from None
         except BrokenPipeError:  # the reader of stdout has ended; click would exit with 1
             raise SystemExit(BROKEN_PIPE) from None
 
@@ -122,33 +111,13 @@ class OneOf(click.ParamType):
 ACCEL = OneOf("wrt.accel.structures:ACCELERATORS")
 
 
-class Setting(click.ParamType):
-    """NAME=VALUE, where VALUE is a number, True, False or text."""
+def silence(context: click.Context, option: click.Parameter, quiet: bool) -> bool:
+    """Report no compilation of kernels in a quiet command."""
+    if quiet:
+        from wrt.core.compiling import WATCH
 
-    name = "NAME=VALUE"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, bool | int | float | str]:
-        name, sign, text = str(value).partition("=")
-        if not sign or not name:
-            self.fail(f"{value!r} is not NAME=VALUE", param, ctx)
-        try:
-            parsed = ast.literal_eval(text)
-        except (ValueError, SyntaxError, MemoryError, RecursionError):
-            parsed = text
-        return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # "0x360" is a size
-
-
-def quiet_option(text: str) -> Decorator:
-    """Return the option -q. A quiet command does not report that kernels are compiled. text: the option's help."""
-
-    def silence(context: click.Context, option: click.Parameter, quiet: bool) -> bool:
-        if quiet:
-            from wrt.core.compiling import WATCH
-
-            context.with_resource(WATCH.reported_by_caller())
-        return quiet
-
-    return click.option("-q", "--quiet", is_flag=True, help=text, callback=silence)
+        context.with_resource(WATCH.reported_by_caller())
+    return quiet
 
 
 def setting(name: str, more: str = "") -> Decorator:
@@ -166,14 +135,14 @@ SHARED: dict[str, Decorator] = {
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
     "camera": click.option("--camera", help="Name or index of a camera in the scene  [default: the first]"),
     "assignments": click.option(
-        "--set", "assignments", type=Setting(), multiple=True,
+        "--set", "assignments", metavar="NAME=VALUE", multiple=True,
         help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are"
              f" {', '.join(SETTINGS)} (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
     "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
     "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
-    "quiet": quiet_option("Print no progress and no warnings"),
+    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no warnings", callback=silence),
     "as_json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON"),
     **{name: setting(name) for name in ("spp", "max_depth", "min_throughput", "clamp", "filter", "fresnel", "sampler", "tonemap")},
     "size": setting("size", ", or a width, which keeps the scene's aspect ratio"),
@@ -186,49 +155,27 @@ def shared(*names: str) -> Decorator:
     return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
 
 
-def names_of(kind: type) -> list[str]:
-    """Return the names of a dataclass's fields."""
-    return [each.name for each in dataclasses.fields(kind)]
-
-
-def option_group(name: str, make: Callable[..., object], names: Sequence[str], options: Sequence[Decorator]) -> Decorator:
-    """Return a decorator that adds `options` to a command. The command receives make(**values of the options) as its argument `name`.
-
-    names: the parameters of `make`. A parameter without an option keeps its default."""
+def option_group(name: str, options: Mapping[str, Decorator]) -> Decorator:
+    """Return a decorator that adds `options`, by the name of their value. The command receives the values as its argument `name`."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def with_group(**values: Parsed) -> None:
-            group = {each: values.pop(each) for each in names if each in values}
-            command(**values, **{name: make(**group)})
+            command(**{name: {each: values.pop(each) for each in options}}, **values)
 
         wrapped: Callable[..., None] = with_group
-        for option in options:
+        for option in options.values():
             wrapped = option(wrapped)
         return wrapped
 
     return decorate
 
 
-def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
-    """Return the values of --set by name. Raises InputError for a name with two different values.
-
-    reserved: names that this command refuses in --set; the value is the option to use instead."""
-    values: dict[str, Parsed] = {}
-    for name, value in assignments:
-        if name in reserved:
-            raise InputError("cannot be used with this command", argument=f"--set {name}", hint=f"{reserved[name]} decides on the value")
-        if name in values and values[name] != value:
-            raise InputError(f"has two values, {values[name]!r} and {value!r}", argument=f"--set {name}", hint="give one")
-        values[name] = value
-    return values
-
-
-def settings_of(assignments: Assignments, options: dict[str, Parsed] | None = None, **reserved: str) -> "SettingChanges":
+def settings_of(assignments: Sequence[str], options: dict[str, Parsed] | None = None, **reserved: str) -> "SettingChanges":
     """Return changes of the scene's settings from --set, and from options such as --spp, which are removed from `options` (None: absent).
 
-    reserved: see values_of. Raises InputError for an invalid setting, and if --set and an option give different values."""
-    from wrt.core.checks import as_size
+    reserved: see `assigned`. Raises InputError for an invalid setting, and if --set and an option give different values."""
+    from wrt.core.checks import as_size, assigned
     from wrt.io.toml.report import check_settings
 
     options = options or {}
@@ -236,7 +183,7 @@ def settings_of(assignments: Assignments, options: dict[str, Parsed] | None = No
     if flags.get("exposure") == "auto":
         flags |= {"exposure": None, "auto_exposure": True}
     flags = {name: value for name, value in flags.items() if value is not None}
-    values = values_of(assignments, **reserved)
+    values: dict[str, Parsed] = dict(assigned(assignments, "--set", reserved))
     if "size" in values:
         values["size"] = list(as_size(values["size"], "--set size"))
     settings = check_settings(values, "--set") if values else {}
@@ -280,13 +227,14 @@ def client_of(cluster: str | None) -> "Client | None":
 CLUSTER = click.option("--cluster", metavar="ADDRESS",
                        help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
-STAGING = option_group("staging", dict, ("up", "studio", "floor", "fill"), (
-    click.option("--up", type=OneOf("wrt.scene.defaults:UP"), default="y", show_default=True, help="Axis of a mesh file that points up"),
-    click.option("--studio/--no-studio", default=True, show_default=True,
-                 help="Light a file without lights by a studio, which glass and smooth surfaces reflect, or by a pale sky"),
-    click.option("--floor", is_flag=True, help="Put a mesh file on a grey floor"),
-    click.option("--fill", type=float,
-                 help="Radiance of a fill light beside a glTF file's own lights  [default: 0, or an estimate beside emissive surfaces]")))
+STAGING = option_group("staging", {
+    "up": click.option("--up", type=OneOf("wrt.scene.defaults:UP"), default="y", show_default=True,
+                       help="Axis of a mesh file that points up"),
+    "studio": click.option("--studio/--no-studio", default=True, show_default=True,
+                           help="Light a file without lights by a studio, which glass and smooth surfaces reflect, or by a pale sky"),
+    "floor": click.option("--floor", is_flag=True, help="Put a mesh file on a grey floor"),
+    "fill": click.option("--fill", type=float, help="Radiance of a fill light beside a glTF file's own lights"
+                                                    "  [default: 0, or an estimate beside emissive surfaces]")})
 
 
 def load(path: Path, quiet: bool, staging: dict[str, Parsed] | None = None) -> "Scene":
@@ -342,22 +290,3 @@ def say(text: object, err: bool = True) -> None:
     text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text))
     with contextlib.suppress(OSError) if err else contextlib.nullcontext():
         click.echo(text, err=err)
-
-
-def progress_writer(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
-    """Return a function that writes a line of progress to stderr.
-
-    On a terminal, each line replaces the last one. Otherwise, at most one line is written in `every` seconds."""
-    terminal = sys.stderr is not None and sys.stderr.isatty()
-    due = time.monotonic()
-
-    def write(line: str) -> None:
-        nonlocal due
-        if terminal:
-            with contextlib.suppress(OSError):
-                click.echo(f"\r\x1b[2K{line[:100]}\r", err=True, nl=False)
-        elif time.monotonic() >= due:
-            due = time.monotonic() + every
-            say(line)
-
-    return (lambda line: None) if quiet else write

@@ -12,7 +12,6 @@ import gc
 import io
 import os
 import sys
-from traceback import extract_tb
 from typing import NoReturn
 
 import click
@@ -46,8 +45,6 @@ COMMANDS: Registry[click.Command] = Registry("command", {
 
 
 GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.
-# Parts of error messages that mean lack of memory: for a thread, for an array of Warp, for a shared library.
-OUT_OF_MEMORY = ("can't start new thread", "Failed to allocate", "failed to map segment")
 
 
 @click.group(cls=Commands, commands=COMMANDS, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -72,18 +69,14 @@ def main() -> None:
         error.show()
         code = error.exit_code
     except OSError as error:  # for example a path too long for the system, or stdout on a full disk
-        to_stdout = error.__traceback__ and extract_tb(error.__traceback__)[-1].name == "echo"  # of click
-        say(f"error: {f'stdout: {error.strerror}' if to_stdout else error}")
+        say(f"error: {error}")
         code = 2
     except (click.Abort, KeyboardInterrupt) as error:  # click raises Abort from KeyboardInterrupt
         cause = error.__cause__ if isinstance(error, click.Abort) else error
         code = exit_code(cause.number if isinstance(cause, Interrupted) else None)
         say("interrupted")
-    except (MemoryError, RuntimeError, ImportError) as error:  # click.Abort is a RuntimeError, too
-        text = f"{error}: {error.__cause__}" if error.__cause__ else str(error)
-        if not (isinstance(error, MemoryError) or any(words in text for words in OUT_OF_MEMORY)):
-            raise
-        say(f"error: not enough memory{': ' if text else ''}{text}")
+    except MemoryError as error:
+        say(f"error: not enough memory: {error}")
         code = 2
     except SystemExit as error:
         code = error.code

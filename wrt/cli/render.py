@@ -1,11 +1,9 @@
 """The commands that make pictures: `render`, with its checkpoint, and `animate`, which makes frames or an animated picture."""
 
-import contextlib
 import os
 import signal
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,14 +37,12 @@ if TYPE_CHECKING:
     from wrt.scene.model import Scene
     from wrt.scene.settings import SettingChanges
 
-STDOUT = Path("-")
-WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 
 
 @click.command(help=f"Render SCENE to a picture. SCENE is .toml, .gltf, .glb, or a mesh: {SUFFIXES}.")
 @shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Picture to write: .png, .exr, .hdr, .jpg or .webp; - is a PNG on stdout  [default: the scene's file name with .png]")
+              help="Picture to write: .png, .exr, .hdr, .jpg or .webp  [default: the scene's file name with .png]")
 @shared("spp", "size", "seed")
 @click.option("--device", default=DEFAULT_DEVICE, show_default=True,
               help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
@@ -63,57 +59,17 @@ WATCH_EVERY = 0.2  # seconds between two looks at a watched file
               help="Stop when the estimated noise is at most this: the root mean square, over pixels and channels, of the"
                    " standard error in linear radiance. --spp is then an upper limit  [default: 65536]")
 @click.option("--checkpoint", "every", type=DURATION, help="Save the samples so far at this interval (30s, 5m, 1h), for --resume")
-@click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Checkpoint  [default: the picture's name + .checkpoint]")
+@click.option("--checkpoint-file", "file", type=click.Path(path_type=Path), help="Checkpoint  [default: the picture's name + .checkpoint]")
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint; if there is none, start from the beginning")
-@click.option("--watch", is_flag=True, help="Render again whenever the file SCENE changes, until Ctrl-C")
 @shared("quiet", "as_json")
-def render(scene: Path, output: Path | None, watch: bool, quiet: bool, **options: Parsed) -> None:
-    if not watch:
-        render_once(scene, output, quiet=quiet, **options)
-        return
-    if output == STDOUT or options["resume"]:
-        raise InputError("makes a picture after each change, which needs a file and a new start", argument="--watch",
-                         hint="give -o a file name, and no --resume")
-    watched(scene, lambda: render_once(scene, output, quiet=quiet, **options), quiet)
-
-
-def watched(scene: Path, make: Callable[[], None], quiet: bool) -> None:
-    """Call `make` now and after each change of the file `scene`, until Ctrl-C. An InputError is reported: the file may be half edited."""
-    with contextlib.suppress(KeyboardInterrupt):
-        while True:
-            seen = stamp(scene)
-            try:
-                make()
-            except InputError as error:
-                say(f"error: {error}")
-            if not quiet:
-                say(f"{scene}: waiting for a change (Ctrl-C ends)")
-            while stamp(scene) in (seen, None):
-                time.sleep(WATCH_EVERY)
-
-
-def stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return values that change when a file is written or replaced; None while it does not exist."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_mtime_ns, status.st_size, status.st_ino
-
-
-def render_once(scene: Path, output: Path | None, *, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
-                as_json: bool, **options: Parsed) -> None:
-    """Render SCENE and write its picture. The arguments are those of the command."""
+def render(scene: Path, output: Path | None, *, assignments: Assignments, staging: dict[str, Parsed], quiet: bool, as_json: bool,
+           **options: Parsed) -> None:
     begin = time.perf_counter()
     from wrt.picture.film import aov_path, depth_range
-    from wrt.picture.image import check_writable, output_format
+    from wrt.picture.image import check_writable
 
     output, bits = output or Path(f"{scene.stem or 'picture'}.png"), options.pop("bits")
-    if output == STDOUT:
-        require_alone(as_json, options)
-        output_format("-.png", bits)
-    else:
-        check_writable(output, bits)
+    check_writable(output, bits)
     if scene.exists():
         from wrt.accel.queries.raw_launches import preload_headers
         from wrt.core.compiling import WATCH
@@ -127,21 +83,15 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
     clock, begin = {"import": time.perf_counter() - begin}, time.perf_counter()
     loaded = load(scene, quiet, staging).with_settings(**settings)
     clock["load"] = time.perf_counter() - begin
-    checkpoint = options.get("checkpoint")
-    if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
-        say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
-    if checkpoint is None and not quiet and os.path.lexists(unused := output.with_name(output.name + SUFFIX)):
-        say(f"{unused}: a checkpoint of an earlier render is here; --resume continues from it, this render begins anew")
-
     with warnings_reported(quiet):
         film = trace(loaded, scene, settings.get("spp"), options, quiet)
         begin = time.perf_counter()
         with held_interrupts() as signals:
-            paths = [] if output == STDOUT else film.save(output, bits=bits, aov=layers)
-            if output == STDOUT:
-                write_to_stdout(film, bits)
+            paths = film.save(output, bits=bits, aov=layers)
+    checkpoint: Path | None = options.get("checkpoint")
     if checkpoint is not None and not (film.stats["interrupted"] or film.stats["timed_out"]):
-        remove_checkpoint(checkpoint)  # the picture is complete
+        if not checkpoint.is_dir():  # the picture is complete
+            checkpoint.unlink(missing_ok=True)
         film.stats["checkpoint"] = None
     if signals:
         film.stats |= {"interrupted": True, "signal": film.stats["signal"] or signals[0]}
@@ -154,18 +104,10 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
     if not quiet and "depth" in (layers or ()) and (ends := depth_range(film.aov["depth"])):
         say(f"depth picture: white is {ends['white']:.4g}, the darkest grey {ends['darkest']:.4g}, linear between, in scene units")
     if not quiet:
-        say(_summary(film, loaded.settings.auto_exposure))
+        for line in _summary(film, loaded.settings.auto_exposure):
+            say(line)
     if film.stats["interrupted"]:
         raise SystemExit(exit_code(film.stats["signal"]))
-
-
-def require_alone(as_json: bool, options: dict[str, Parsed]) -> None:
-    """Raise InputError for an option that writes beside a picture on stdout, and if stdout is closed."""
-    if sys.stdout is None:
-        raise InputError("is stdout, which is closed", argument="-o -", hint="give -o a file name")
-    for name, given in (("json", as_json), ("aov", options["aov"]), ("checkpoint", options["every"]), ("resume", options["resume"])):
-        if given and not (name in ("checkpoint", "resume") and options["checkpoint_file"]):
-            raise InputError("has no place if the picture goes to stdout", argument=f"--{name}", hint="give -o a file name")
 
 
 def check_options(output: Path, assignments: Assignments, options: dict[str, Parsed]) -> "SettingChanges":
@@ -176,7 +118,7 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     from wrt.scene.model import Scene
 
     settings = settings_of(assignments, options)
-    options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
+    options |= checkpoint_options(output, options.pop("every"), options.pop("file"), options.pop("resume"))
     Scene().with_settings(**settings)
     options |= device_options(options.pop("cluster"), options.pop("device"))
     Options(**options)
@@ -197,35 +139,26 @@ def trace(loaded: "Scene", path: Path, spp: int | None, options: dict[str, Parse
     return film
 
 
-LEAST_LOSS = 0.001  # Mean radiance lost by cut rays that the summary mentions, in surroundings of radiance 1; 8 bits have steps of 0.004.
-
-
-def _summary(film: "Film", auto_exposure: bool) -> str:
-    """Return a text with samples, rays, what cut rays cost, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
+def _summary(film: "Film", auto_exposure: bool) -> Iterator[str]:
+    """Yield lines with samples, rays, what is missing in the picture, and the seconds of each stage ("compile" overlaps "upload")."""
     s = film.stats
-    end = "interrupted" if s["interrupted"] else "time limit" if s["timed_out"] else ""
-    note = f" ({end})" if end else ""
-    if s.get("resumed"):
-        note += f", {s['resumed']['samples']} spp from the checkpoint"
-    if film.samples.min() == 0:
-        note = f" ({end}: {(film.samples == 0).mean():.0%} of the pixels are still black)"
-    black = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
-    if "clamp" in film.metadata:
-        black += f"; clamp {film.metadata['clamp']:g} took {s['clamped_share']:.2g} of the light"
-    if s.get("target_error") is not None:
-        note += f", estimated error {s['estimated_error']:.3g}"
-        note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
-    hint = depth_hint(s, film.metadata["max_depth"])
-    lost = s["lost_throughput_per_sample"]
-    cut = (f"; rays cut by max_depth and min_throughput would add {lost:.2g} to the picture's mean in surroundings of radiance 1"
-           if lost >= LEAST_LOSS and not hint else "")
-    hint = f"\n{hint}" if hint else ""
-    saved = f"\n{s['checkpoint']}: --resume continues from this checkpoint" if s.get("checkpoint") else ""
-    resumed = f" ({s['resumed']['seconds']:.2f} before the resume)" if s.get("resumed") else ""
-    seconds = ", ".join(f"{name} {value:.2f}{resumed if name == 'trace' else ''}" for name, value in s["seconds"].items())
-    exposed = f"exposure {film.exposure:+.2g}, chosen automatically (--exposure 0: none)\n" if auto_exposure else ""
-    return (f"{exposed}{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s"
-            f"{cut}{black}\nseconds: {seconds}{saved}{hint}")
+    if auto_exposure:
+        yield f"exposure {film.exposure:+.2g}, chosen automatically (--exposure 0: none)"
+    resumed, target = s.get("resumed"), s.get("target_error")
+    yield ", ".join(filter(None, (
+        f"{film.metadata['spp']} spp{' (interrupted)' if s['interrupted'] else ' (time limit)' if s['timed_out'] else ''}",
+        f"{resumed['samples']} spp from the checkpoint" if resumed else "",
+        f"estimated error {s['estimated_error']:.3g}" if target is not None else "",
+        f"above the target of {target:g}" if target is not None and not s["target_reached"] else "",
+        f"{(film.samples == 0).mean():.0%} of the pixels are still black" if film.samples.min() == 0 else "",
+        f"{s['rays'] / 1e6:.2f} M rays", f"{s['rays_per_second'] / 1e6:.2f} Mray/s",
+        f"{s['not_finite']} samples were not finite and count as black" if s["not_finite"] else "",
+        f"clamp {film.metadata['clamp']:g} took {s['clamped_share']:.2g} of the light" if "clamp" in film.metadata else "")))
+    yield f"seconds: {', '.join(f'{name} {value:.2f}' for name, value in s['seconds'].items())}"
+    if s.get("checkpoint"):
+        yield f"{s['checkpoint']}: --resume continues from this checkpoint"
+    if hint := depth_hint(s, film.metadata["max_depth"]):
+        yield hint
 
 
 EVERY = 60.0  # seconds between two checkpoints
@@ -240,26 +173,6 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
     if os.path.realpath(file) == os.path.realpath(output):
         raise InputError("is the picture; a checkpoint needs a file of its own", path=file)
     return {"checkpoint": file, "checkpoint_every": EVERY if every is None else every, "resume": resume}
-
-
-def write_to_stdout(film: "Film", bits: int | None) -> None:
-    """Write the picture to stdout as a PNG file."""
-    from wrt.picture.image import encode_png
-    from wrt.picture.tonemap import to_codes
-
-    codes = to_codes(film.pixels, film.exposure, film.tonemap, bits or 8)
-    click.echo(encode_png(codes, film.metadata), nl=False)
-
-
-def remove_checkpoint(path: Path) -> None:
-    """Remove the checkpoint of a finished picture. Raises InputError if that fails."""
-    if path.is_dir():  # not written by wrt; the render has warned that the checkpoint is not saved
-        return
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be removed: {error.strerror}",
-                         path=path, hint="remove this checkpoint by hand; the picture is finished") from error
 
 
 @click.command()

@@ -1,128 +1,29 @@
-"""Parts that the measuring commands share: options, progress, and the report as text, JSON and Markdown file."""
+"""The command of a measurement: options from the fields of its Plan, progress, and the report as text, Markdown, JSON or CSV."""
 
 import dataclasses
 import signal
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import MISSING, dataclass
-from functools import partial
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import MISSING
+from itertools import chain
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
 
-from wrt.cli.common import (
-    ACCEL,
-    DURATION,
-    SHARED,
-    Decorator,
-    Names,
-    OneOf,
-    Parsed,
-    json_text,
-    names_of,
-    option_group,
-    progress_writer,
-    quiet_option,
-    say,
-    say_json,
-    warnings_reported,
-)
+from wrt.cli.common import ACCEL, DURATION, Decorator, Names, OneOf, Parsed, json_text, naming, say, say_json, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.files import check_writable, write_bytes
 from wrt.core.interrupts import exit_code
-from wrt.lab import STRUCTURES, Plan
+from wrt.lab import STRUCTURES, OnScene, Plan
 from wrt.renderer.progress import TimeLeft
 
 # The type of an option, by the annotation of the plan's field.
-TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, float: DURATION}
-
-
-@dataclass(frozen=True)
-class Reporting:
-    """Options of a report, and the functions that write it."""
-
-    output: Path | None = None  # file or folder to write, as the command defines
-    quiet: bool = False
-    as_json: bool = False
-
-    def progress(self, line: str) -> None:
-        if not self.quiet:
-            say(line)
-
-    @property
-    def progress_writer(self) -> Callable[[str], None]:
-        return progress_writer(self.quiet)
-
-    def check_markdown(self) -> None:
-        """Raise InputError unless `output` is None or a Markdown file that can be written."""
-        self.check_report({})
-
-    def check_report(self, others: Collection[str]) -> str:
-        """Return the suffix of `output`, "" for None. Raise InputError unless it is .md or one of `others`, and can be written."""
-        if self.output is None:
-            return ""
-        suffix = self.output.suffix.lower()
-        if suffix not in (".md", *others):
-            raise InputError(f"must be a {' or '.join(('.md', *others))} file, the report", path=self.output)
-        check_writable(self.output)
-        return suffix
-
-    def write_rows(self, data: Mapping[str, object], text: str, files: Mapping[str, Callable[[], bytes]]) -> None:
-        """Write the report `output`, if any, in the format of its suffix: one of `files`, `data` as JSON, or `text` as Markdown."""
-        if self.output is None:
-            return
-        suffix = self.output.suffix.lower()
-        if suffix == ".json":
-            self.write(json_text(data))
-        elif suffix in files:
-            write_bytes(self.output, files[suffix]())
-        else:
-            self.write(text)
-
-    def write(self, text: str) -> None:
-        if self.output is not None:
-            write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
-
-    def end(self, text: str, data: Mapping[str, object], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
-        """Print `data` as JSON if `as_json` is set. Otherwise, print `text` and the written files: `paths`, or `output` if that is empty.
-
-        interrupted: number of the signal that ended the work; it sets the exit code. None: the work was not interrupted."""
-        if self.as_json:
-            say_json(data)
-        else:
-            for line in (text, *(paths or filter(None, [self.output]))):
-                say(line, err=False)
-        if interrupted is not None:
-            say("interrupted: the results so far are kept")
-            raise SystemExit(exit_code(interrupted))
-
-
-def reporting(report: str = "Write the tables as Markdown (.md)", *, quiet: str = "Print no progress and no warnings") -> Decorator:
-    """Return a decorator that adds the options of Reporting. The command receives the object as `how`. report, quiet: help of -o and -q."""
-    file = click.option("-o", "--output", type=click.Path(path_type=Path), help=report)
-    return option_group("how", Reporting, names_of(Reporting), [SHARED["as_json"], quiet_option(quiet), file])
-
-
-def planned(plan: type[Plan]) -> Decorator:
-    """Return a decorator that adds the options of a Plan (wrt.lab). The command receives the object as `plan`.
-
-    --quick sets the options that the command line leaves out to the values in plan.QUICK, and lists them on stderr."""
-
-    def make(quick: bool, **values: Parsed) -> Plan:
-        if quick:
-            context = click.get_current_context()
-            smaller = {name: value for name, value in plan.QUICK.items()
-                       if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
-            replaced = [f"{name.replace('_', '-')} {value} instead of {values[name]}" for name, value in smaller.items()]
-            say(f"{context.info_name} --quick: {', '.join(replaced) or 'no effect, since the command line sets every option'}")
-            values |= smaller
-        return plan(**values)
-
-    types = get_type_hints(plan)
-    flag = click.option("--quick", is_flag=True, help="Get rough figures soon: use smaller defaults, and list them on stderr")
-    parameters = [parameter(each, types[each.name]) for each in dataclasses.fields(plan)]
-    return option_group("plan", make, ["quick", *names_of(plan)], [*parameters[::-1], flag])
+TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, str | None: str, float: DURATION}
+OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path),
+                      help="Write the tables as Markdown (.md), or the rows as .csv or .json")
+QUICK = click.option("--quick", is_flag=True, help="Get rough figures soon: use smaller defaults, and list them on stderr")
 
 
 def parameter(each: dataclasses.Field[object], of_type: object) -> Decorator:
@@ -137,36 +38,48 @@ def parameter(each: dataclasses.Field[object], of_type: object) -> Decorator:
     flag = f"--{each.name.replace('_', '-')}"
     if of_type is bool:
         return click.option(flag, each.name, is_flag=True, help=text)
-    kind = Names() if several else ACCEL if names == STRUCTURES else TYPES[of_type]
+    if several:  # names,names or several times
+        return click.option(flag, each.name, type=Names(), multiple=True, default=each.default, show_default=bool(each.default), help=text,
+                            callback=lambda context, option, values: tuple(chain(*values)))
+    kind = ACCEL if names == STRUCTURES else TYPES[of_type]
     return click.option(flag, each.name, type=kind, default=each.default, show_default="[default" not in text, help=text)
 
 
-def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs a plan's study."""
+def smaller(plan: type[Plan], values: dict[str, Parsed]) -> dict[str, Any]:
+    """Return the values of plan.QUICK for the options that the command line leaves out, and list them on stderr."""
+    context = click.get_current_context()
+    found = {name: value for name, value in plan.QUICK.items() if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
+    replaced = [f"{name.replace('_', '-')} {value} instead of {values[name]}" for name, value in found.items()]
+    say(f"{context.info_name} --quick: {', '.join(replaced) or 'no effect, since the command line sets every option'}")
+    return found
 
-    @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
-    @planned(plan)
-    @reporting(plan.OUTPUT)
-    def command(how: Reporting, plan: Plan) -> None:
-        from wrt.lab.bench import plot, report
 
+def measured(kind: type[Plan]) -> click.Command:
+    """Return the command that runs the study of a kind of plan. Ctrl-C keeps the finished rows."""
+
+    def measure(quick: bool, output: Path | None, quiet: bool, as_json: bool, **values: Parsed) -> None:
+        from wrt.lab.bench import report
+
+        plan = kind(**values | (smaller(kind, values) if quick else {}))
+        suffix = "" if output is None else output.suffix.lower()
+        if output is not None:
+            if suffix not in (".md", ".json", ".csv"):
+                raise InputError("must be a .md, .json or .csv file, the report", path=output)
+            check_writable(output)
         study = report.study_of(plan)
-        writers = report.WRITERS | getattr(study, "WRITERS", {})
-        suffix = how.check_report((".json", *writers))
-        if suffix in (".png", ".svg"):
-            plot.new_figure(1.0, 1.0)  # raises InputError if matplotlib is missing
-        total = sum(1 for _ in study.groups(plan))  # reads all meshes, and so refuses a damaged one at once
-        machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         rows: list[Any] = []
-        interrupted, left = None, TimeLeft(total)
+        interrupted, machine = None, ""
 
         def done(group: list[Any]) -> None:
             rows.extend(group)
             left.done += 1
-            for row in group:
-                how.progress(f"{report.line(plan, row)}{f'  ({left.done:.0f} of {total}{left})' if left.done < total else ''}")
+            more = f"{left.done:.0f} of {left.total}{left}" if left.done < left.total else ""
+            for text in () if quiet else [report.line(plan, row) for row in group] or [""]:
+                say("  ".join(filter(None, (text, f"({more})" if more else ""))))
 
-        with warnings_reported(how.quiet):
+        with warnings_reported(quiet), naming(Path(plan.scene)) if isinstance(plan, OnScene) else nullcontext():
+            left = TimeLeft(sum(1 for _ in study.groups(plan)))  # reads all files, and so refuses a damaged one at once
+            machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
             try:
                 report.run(plan, done)
             except KeyboardInterrupt as stop:
@@ -175,7 +88,22 @@ def measured(plan: type[Plan]) -> click.Command:
                 interrupted = int(getattr(stop, "number", signal.SIGINT))
                 machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
         text, data = report.text(rows, plan, machine), {"machine": machine, **report.data(rows, plan)}
-        how.write_rows(data, text, {name: partial(writer, rows, plan, machine, name) for name, writer in writers.items()})
-        how.end(text, {**data, "output": how.output}, interrupted=interrupted)
+        if output is not None:
+            content = json_text(data) if suffix == ".json" else report.csv_text(rows, plan, machine) if suffix == ".csv" else text
+            write_bytes(output, f"{content.rstrip()}\n".encode())
+        if as_json:
+            say_json({**data, "output": output})
+        else:
+            for line in filter(None, (text, output)):
+                say(line, err=False)
+        if interrupted is not None:
+            say("interrupted: the results so far are kept")
+            raise SystemExit(exit_code(interrupted))
 
-    return command
+    types = get_type_hints(kind)
+    parameters = [parameter(each, types[each.name]) for each in dataclasses.fields(kind)]
+    command: Any = measure
+    decorators: list[Decorator] = [shared("quiet", "as_json"), OUTPUT, *parameters[::-1], QUICK]
+    for decorate in decorators:
+        command = decorate(command)
+    return click.command(kind.COMMAND.split()[-1], help=kind.__doc__)(command)

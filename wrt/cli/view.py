@@ -10,30 +10,30 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import STAGING, Assignments, Parsed, load, names_of, naming, option_group, say, settings_of, shared
+from wrt.cli.common import STAGING, Assignments, Parsed, load, naming, option_group, say, settings_of, shared
 from wrt.viewer.access import Place
 
-PLACE_OPTIONS = (
-    click.option("--allow-origin", "allow_origins", multiple=True, metavar="ORIGIN",
-                 help="Another origin under which browsers reach the viewer, such as a proxy's https://example.org; repeatable"),
-    click.option("--host", default="127.0.0.1", show_default=True,
-                 help="Address to listen on. 127.0.0.1: this machine only; 0.0.0.0: all machines that can reach this machine"),
-    click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
-                 help="Port to listen on; 0 chooses a free port"),
-)
+PLACE = option_group("place", {
+    "allow_origins": click.option("--allow-origin", "allow_origins", multiple=True, metavar="ORIGIN",
+                                  help="Another origin under which browsers reach the viewer, such as a proxy's https://example.org;"
+                                       " repeatable"),
+    "host": click.option("--host", default="127.0.0.1", show_default=True,
+                         help="Address to listen on. 127.0.0.1: this machine only; 0.0.0.0: all machines that can reach this machine"),
+    "port": click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
+                         help="Port to listen on; 0 chooses a free port")})
 
 
 @click.command()
 @shared("scene")
-@option_group("place", Place, names_of(Place), PLACE_OPTIONS)
+@PLACE
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: on a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples per pixel of the finished picture")
 @click.option("--target-error", type=float,
               help="Finish once the estimated error is at most this: root mean square over the picture, linear radiance")
 @STAGING
 @shared("device", "threads", "camera", "accel", "assignments", "quiet")
-def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
-         **options: Parsed) -> None:
+def view(scene: Path, place: dict[str, Parsed], open_browser: bool, spp: int, assignments: Assignments, staging: dict[str, Parsed],
+         quiet: bool, **options: Parsed) -> None:
     """Show SCENE in a browser with an orbit camera. The picture gets finer while the camera rests.
 
     The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
@@ -42,7 +42,8 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     from wrt.viewer.server import import_websockets, listen
 
     import_websockets()
-    listen(place).close()  # raises InputError before the scene is read
+    where = Place(**place)
+    listen(where).close()  # raises InputError before the scene is read
     from wrt.lab.walk.walk import walk
     from wrt.renderer.options import Options
 
@@ -51,7 +52,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     loaded = load(scene, quiet, staging).with_settings(**settings)
     with naming(scene):
         loaded.camera(options["camera"])  # raises InputError with the file's name
-    page = Page(loaded, rendering, place, spp, walk_of=walk, warn=(lambda text: None) if quiet else say)
+    page = Page(loaded, rendering, where, spp, walk_of=walk, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
         say("Ctrl-C ends the viewer")

@@ -4,7 +4,8 @@ import difflib
 import operator
 import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from types import UnionType
@@ -91,6 +92,32 @@ def as_choice(value: str, choices: Collection[str], what: str) -> str:
     if value not in choices:
         raise wrong(what, f"must be one of {', '.join(choices)}; got {shown(value)}", did_you_mean(value, choices).rstrip() or None)
     return value
+
+
+def assigned(words: Iterable[str], argument: str, reserved: Mapping[str, str] = {}) -> dict[str, bool | int | float | str]:
+    """Return the values of texts NAME=VALUE by name: numbers, True, False, or text. Raise InputError for a name with two values.
+    argument: of the words, for messages; reserved: names that are refused -> the option to use instead."""
+    values: dict[str, bool | int | float | str] = {}
+    for word in words:
+        name, sign, text = word.partition("=")
+        if not (name and sign):
+            raise InputError(f"{word!r} is not NAME=VALUE", argument=argument)
+        if name in reserved:
+            raise InputError("cannot be used with this command", argument=f"{argument} {name}",
+                             hint=f"{reserved[name]} decides on the value")
+        value = as_literal(text)
+        if name in values and values[name] != value:
+            raise InputError(f"has two values, {values[name]!r} and {value!r}", argument=f"{argument} {name}", hint="give one")
+        values[name] = value
+    return values
+
+
+def as_literal(text: str) -> bool | int | float | str:
+    """Return the number, True or False that a text is, otherwise the text."""
+    for kind in ({"True": True, "False": False}.__getitem__, int, float):
+        with suppress(KeyError, ValueError):
+            return kind(text)
+    return text
 
 
 def require_known(name: str, known: Collection[str], what: str, argument: str | None = None) -> None:

@@ -6,7 +6,10 @@ The __init__ of each room declares the room's measurements. It imports nothing h
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
+
+if TYPE_CHECKING:
+    from wrt.scene.model import Scene
 
 # Names that an option accepts: what messages call such a name, and the table of the names.
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
@@ -31,11 +34,15 @@ def the_kinds(*default: str) -> Sequence[str]:
 
 
 def the_seed() -> int:
-    return option(0, "Seed of the random rays")
+    return option(0, "Seed of the random numbers")
 
 
 def the_device() -> str:
     return option("cpu", "Device to measure on: cpu, cuda:0, ... (`wrt devices` lists them)", check="wrt.core.device:start")
+
+
+def the_threads() -> int | None:
+    return option(None, "Number of CPU threads  [default: all cores]", check="wrt.core.threads:thread_count")
 
 
 def looked_up(place: str) -> Any:
@@ -48,13 +55,12 @@ def looked_up(place: str) -> Any:
 class Plan:
     """Options of a measurement. Raise InputError for a number out of its range and for an unknown name.
 
-    COMMAND: name of the command; STUDY: module that measures; QUICK: values that replace the defaults under --quick;
-    OUTPUT: help of -o."""
+    COMMAND: name of the command; STUDY: module that measures (see wrt.lab.bench.report.study_of); QUICK: values that replace the defaults
+    under --quick."""
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
     QUICK: ClassVar[Mapping[str, Any]] = {}
-    OUTPUT: ClassVar[str] = "Write the tables as Markdown (.md), or the rows as .csv or .json"
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
@@ -72,3 +78,22 @@ class Plan:
                 looked_up(rules["check"])(value)
             if isinstance(value, Sequence) and not value and (each.default is MISSING or each.default):
                 raise InputError("must name one or more", argument=each.name)
+
+
+@dataclass(frozen=True)
+class OnScene(Plan):
+    """A Plan whose measurement renders one scene: a path, or a Scene in Python."""
+
+    scene: Any = option(MISSING)  # noqa: RUF009
+    size: str = option("128x72", "Width x height of the picture, in pixels", check="wrt.core.checks:as_size")
+    camera: str | None = option(None, "Name or index of a camera in the scene  [default: the first]")
+    set: Sequence[str] = option((), "Settings of the scene to change, such as filter=box,max_depth=3 (docs/scene_format.md)")
+
+    def load(self) -> "Scene":
+        """Return the scene with its settings and size."""
+        from wrt.core.checks import as_size, assigned
+        from wrt.io.load import as_scene
+        from wrt.io.toml.report import check_settings
+
+        settings = check_settings(assigned(self.set, "--set", {"size": "--size", "spp": "another option"}), "--set")
+        return as_scene(self.scene).with_settings(**settings).with_settings(size=as_size(self.size))

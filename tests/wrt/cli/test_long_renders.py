@@ -97,7 +97,7 @@ def test_a_finished_render_leaves_no_checkpoint() -> None:
     plain = run("render", "box.obj", *SMALL, "-o", "a.exr")
     assert plain.code == 0
     result = run("render", "box.obj", *SMALL, "-o", "b.exr", "--checkpoint", "60s")
-    assert (result.code, result.out) == (0, "b.exr\n") and new_files() == {"a.exr", "b.exr"} and "--resume" not in result.err
+    assert (result.code, result.out) == (0, "b.exr\n") and new_files() == {"a.exr", "b.exr"}
     assert channels("a.exr") == channels("b.exr")
 
 
@@ -113,21 +113,6 @@ def test_time_limits_and_resumes(folder: Path) -> None:
     assert before < after.min() == after.max()
     whole = run("render", "box.obj", "--size", "64x36", "--spp", int(after.max()), "-o", "c.exr")
     assert whole.code == 0 and channels("a.exr") == channels("c.exr")
-
-
-def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
-    result = run("render", "box.obj", *SMALL, "--resume")
-    assert result.code == 0 and "box.png.checkpoint: no checkpoint yet, rendering from the beginning\n" in result.err
-    assert run("render", "box.obj", *SMALL, "--resume", "-q").err == ""
-
-
-def test_a_render_beside_a_checkpoint_says_that_it_begins_anew() -> None:
-    Path("box.png.checkpoint").write_bytes(b"of an earlier render")
-    said = "box.png.checkpoint: a checkpoint of an earlier render is here; --resume continues from it"
-    result = run("render", "box.obj", *SMALL)
-    assert result.code == 0 and said in result.err and Path("box.png.checkpoint").read_bytes() == b"of an earlier render"
-    assert said not in run("render", "box.obj", *SMALL, "-q").err
-    assert said not in run("render", "box.obj", *SMALL, "-o", "a.png").err
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

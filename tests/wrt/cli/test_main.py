@@ -8,8 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
+from tests.command_line import BOX_OBJ, Result, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.picture_metadata import read_metadata
 from wrt import __version__, load_accel
 from wrt.cli import common as cli_common
-from wrt.cli.render import watched
-from wrt.core.errors import InputError
 from wrt.io.load import load_scene, schema
-from wrt.picture import film as film_module
 from wrt.picture.image import read_channels, read_image, write_image
-from wrt.renderer import progress as progress_module
-from wrt.renderer.options import Progress
 from wrt.renderer.plan import features_of, switches
-from wrt.renderer.schedule import film_of
 
 SMALL = ("--size", "32x18", "--spp", 2)
 TWO_CAMERAS = """\
@@ -97,15 +89,6 @@ def test_render_writes_a_picture_and_says_its_name_on_stdout() -> None:
     assert metadata.items() >= {"scene": "box.obj", "camera": "framing", "spp": "2", "seed": "0"}.items()
 
 
-def test_the_summary_says_what_cut_rays_cost_only_if_it_matters() -> None:
-    command = ("render", str(ROOT / "scenes" / "whitted.toml"), *SMALL, "-o", "whitted.png", "--json")
-    for least in ("0.0001", "0.5"):
-        stats = json.loads(run(*command, "--min-throughput", least).out)
-        told = f" would add {stats['lost_throughput_per_sample']:.2g} to the picture's mean in surroundings of radiance 1"
-        result = run(*command[:-1], "--min-throughput", least)
-        assert stats["cut_by_throughput"] > 0 and (told in result.err) == (least == "0.5"), result.err
-
-
 def test_quiet_is_silent_but_for_the_data() -> None:
     assert run("render", "box.obj", *SMALL, "--quiet") == Result(0, "box.png\n", "")
 
@@ -121,28 +104,18 @@ def test_json_holds_statistics_and_nothing_else_is_on_stdout() -> None:
     assert all(value >= 0 for value in facts["seconds"].values())
 
 
-@pytest.mark.parametrize(("value", "expected"), [
-    (float("inf"), None), (float("nan"), None), (-float("inf"), None), (1.5, 1.5), (np.float64("inf"), None),
-    ({"a": [float("nan"), (1, float("inf"))]}, {"a": [None, [1, None]]}), (Path("x"), "x"), ({1: True}, {"1": True}),
-], ids=str)
-def test_json_is_json_whatever_is_in_it(value: Any, expected: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    cli_common.say_json({"value": value})
-    assert strict_json(capsys.readouterr().out) == {"value": expected}
+def test_json_is_json_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    cli_common.say_json({"a": [float("nan"), (1, -float("inf"))], "b": np.float64("inf"), "c": Path("x"), "d": {1: True}})
+    assert strict_json(capsys.readouterr().out) == {"a": [None, [1, None]], "b": None, "c": "x", "d": {"1": True}}
 
 
 def test_layers_are_files_beside_a_png_and_channels_in_an_exr() -> None:
     names = ("depth", "normal", "albedo", "prim_id", "material_id")
     assert run("render", "box.obj", *SMALL, "-o", "a.png", "--aov", ",".join(names)).code == 0
-    assert new_files() == {"a.png", *(f"a.{name}.png" for name in names)}
+    assert new_files() == {"a.png", *(f"a.{name}.png" for name in names)} and Path("a.png").read_bytes()[24] == 8
     result = run("render", "box.obj", *SMALL, "-o", "b.exr", "--aov", "depth, normal")
     assert result.out == "b.exr\n" and {"depth.Z", "normal.X", "samples", "variance.R"} <= read_channels("b.exr").keys()
     assert "prim_id" not in read_channels("b.exr")
-
-
-@pytest.mark.parametrize(("arguments", "bits"), [(["-o", "a.png"], 8), (["-o", "a.png", "--bits", 16], 16)])
-def test_bits_of_a_png(arguments: list[Any], bits: int) -> None:
-    assert run("render", "box.obj", *SMALL, *arguments).code == 0
-    assert Path("a.png").read_bytes()[24] == bits
 
 
 def test_a_crop_is_that_part_of_the_whole_picture() -> None:
@@ -150,15 +123,6 @@ def test_a_crop_is_that_part_of_the_whole_picture() -> None:
     assert run("render", "box.obj", *SMALL, "-o", "part.exr", "--crop", "5, 3,21,10").code == 0
     whole, part = read_channels("whole.exr"), read_channels("part.exr")
     assert whole.keys() == part.keys() and all(np.array_equal(part[name], whole[name][3:10, 5:21]) for name in whole)
-
-
-def test_the_seed_and_the_threads() -> None:
-    pictures = []
-    for i, options in enumerate((("--threads", 1), ("--threads", 2), ("--seed", 0), ("--seed", 1))):
-        assert run("render", "box.obj", *SMALL, "-o", f"{i}.exr", *options).code == 0
-        pictures.append(read_image(f"{i}.exr"))
-    assert np.array_equal(pictures[0], pictures[1]) and np.array_equal(pictures[0], pictures[2])
-    assert not np.array_equal(pictures[0], pictures[3])
 
 
 def test_tone_mapping_and_exposure_change_the_png_only() -> None:
@@ -187,89 +151,47 @@ def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:
     assert 1 <= samples.min() == samples.max() < 1 << 24
 
 
-def test_names_that_cannot_be_encoded_are_no_reason_to_fail() -> None:
-    name = os.fsdecode(b"box\xff.obj")
-    try:
-        os.rename("box.obj", name)
-    except OSError:
-        pytest.skip("this system has no such file names")
-    for suffix in ("png", "exr", "hdr"):
-        assert run("render", name, *SMALL, "-o", f"a.{suffix}").code == 0
-        assert read_metadata(f"a.{suffix}")["scene"] == "box?.obj"
-
-
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
-HUGE = "9" * 5000  # more digits than Python converts to an integer
 WRONG = [
-    (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "100000x100000"], "size must be"),
-    (["--size", "640x"], "write 640x360"), (["--size", "0"], "size must be"), (["-o", "-", "--json"], "--json"),
-    (["-o", "-", "--resume"], "--resume has no place"), (["-o", "-", "--checkpoint", "5s"], "--checkpoint has no place"),
-    (["-o", "-", "--aov", "depth"], "--aov"), (["-o", "-", "--bits", "32"], "bits"), (["--size", "-1x3"], "write 640x360"),
-    (["--size", HUGE + "x1"], "write 640x360"),
-    (["--spp", "0"], "spp must be 1 to"), (["--spp", "-1"], "spp must be"), (["--spp", "1000000000"], "spp must be"),
-    (["--spp", "1.5"], "'--spp'"), (["--spp", "many"], "'--spp'"),
-    (["--seed", "-1"], "seed must be 0 to"), (["--seed", str(2**32)], "seed must be 0 to"),
-    (["--crop", "1,2,3"], "write X0,Y0,X1,Y1"), (["--crop", "-1,0,4,4"], "write X0,Y0,X1,Y1"),
-    (["--crop", "²,0,1,1"], "write X0,Y0,X1,Y1"), (["--crop", "0,0,1," + HUGE], "write X0,Y0,X1,Y1"),
+    (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "640x"], "write 640x360"), (["--size", "0"], "size must be"),
+    (["--size", "9" * 5000 + "x1"], "write 640x360"), (["--spp", "0"], "spp must be 1 to"), (["--spp", "many"], "'--spp'"),
+    (["--seed", str(2**32)], "seed must be 0 to"), (["--crop", "1,2,3"], "write X0,Y0,X1,Y1"),
     (["--accel", "nope"], "no structure 'nope'; there is bvh"), (["--device", "nope"], "no device 'nope'; there is cpu"),
-    (["--filter", "nope"], "filter must be one of box"), (["--fresnel", "nope"], "fresnel must be one of exact"),
-    (["--tonemap", "nope"], "tonemap must be one of none"), (["--aov", "depth,nope"], "no AOV 'nope'"),
-    (["--bits", "7"], ".png is written with 8 or 16 bits, not 7"),
-    (["--threads", "0"], "threads must be 1 to"),
-    (["--max-depth", "-1"], "max_depth must be 0 to 64"), (["--max-depth", "65"], "max_depth must be 0 to 64"),
-    (["--min-throughput", "nan"], "min_throughput must be finite"), (["--min-throughput", "2"], "in [0, 1]"),
-    (["--exposure", "nan"], "exposure must be finite"), (["--exposure", "1e9"], "exposure must be"),
-    (["--time-limit", "0"], "time_limit must be more than 0"), (["--time-limit", "soon"], "write 30s, 5m or 1h"),
-    (["--time-limit", "-1"], "write 30s"), (["--nope"], "--nope"), (["another.obj"], "another.obj"),
+    (["--filter", "nope"], "filter must be one of box"), (["--aov", "depth,nope"], "no AOV 'nope'"),
+    (["--bits", "7"], ".png is written with 8 or 16 bits, not 7"), (["--threads", "0"], "threads must be 1 to"),
+    (["--max-depth", "65"], "max_depth must be 0 to 64"), (["--min-throughput", "nan"], "min_throughput must be finite"),
+    (["--exposure", "1e9"], "exposure must be"), (["--time-limit", "soon"], "write 30s, 5m or 1h"), (["--nope"], "--nope"),
+    (["another.obj"], "another.obj"), (["-o", "nowhere/a.png"], "nowhere/a.png: its folder does not exist"),
+    (["-o", "folder.png"], "folder.png: is a folder"), (["-o", "a.gif"], "a.gif: cannot write .gif; use .png, .exr, .hdr"),
+    (["-o", "a"], "a: cannot write a file without a suffix"), (["-o", "a" * 300 + ".png"], "too long"),
+    (["-o", "a.png", "--aov", "depth,normal"], "a.normal.png: is a folder"),
 ]
 
 
-@pytest.fixture
-def unreadable() -> None:
-    """Replace box.obj by an empty file: a command that reads it ends with another error."""
-    Path("box.obj").write_text("")
-
-
 @pytest.mark.parametrize(("arguments", "message"), WRONG, ids=lambda value: str(value)[:40])
-def test_a_wrong_option_is_reported_before_the_scene_is_read(arguments: list[str], message: str, unreadable: None) -> None:
+def test_a_wrong_option_is_reported_before_the_scene_is_read(arguments: list[str], message: str) -> None:
+    Path("box.obj").write_text("")  # a command that reads it ends with another error
     Path("box.png").write_bytes(b"old")
+    for name in ("folder.png", "a.normal.png"):
+        Path(name).mkdir()
     result = run("render", "box.obj", *arguments)
     refused(result, message)
-    assert "warning" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
+    assert "warning" not in result.err and Path("box.png").read_bytes() == b"old"
+    assert new_files() == {"box.png", "folder.png", "a.normal.png"}
 
 
-@pytest.mark.parametrize("crop", ["0,0,33,18", "5,5,5,6", "40,0,50,10"])
+@pytest.mark.parametrize("crop", ["0,0,33,18", "5,5,5,6"])
 def test_a_crop_outside_the_picture(crop: str) -> None:
     refused(run("render", "box.obj", *SMALL, "--crop", crop), f"crop must be within the picture of 32x18, got {crop}")
     assert new_files() == set()
 
 
-@pytest.mark.parametrize(("output", "message"), [
-    ("nowhere/a.png", "nowhere/a.png: its folder does not exist"), ("folder.png", "folder.png: is a folder"),
-    ("a.gif", "a.gif: cannot write .gif; use .png, .exr, .hdr"), ("a", "a: cannot write a file without a suffix"),
-    ("", "cannot write a file without a suffix"), ("box.obj/a.png", "its folder does not exist"),
-    ("a" * 300 + ".png", "too long"),
-])
-def test_a_wrong_output_is_reported_before_the_scene_is_read(output: str, message: str, unreadable: None) -> None:
-    Path("folder.png").mkdir()
-    refused(run("render", "box.obj", "-o", output), message)
-    assert new_files() == {"folder.png"}
-
-
-def test_a_layer_that_cannot_be_written_is_reported_before_the_scene_is_read(unreadable: None) -> None:
-    Path("a.normal.png").mkdir()
-    refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")
-    assert new_files() == {"a.normal.png"}
-
-
 @pytest.mark.parametrize(("scene", "message"), [
-    ("nothing.obj", "nothing.obj: no such file"), ("nothing.xyz", "nothing.xyz: no such file"),
-    (".", ".: is a directory"), ("/", "/: is a directory"), ("..", "..: is a directory"), ("", ".: is a directory"),
-    ("box.txt", "box.txt: is no scene file"), ("empty.toml", "empty.toml: the scene has no shapes"),
-    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: has no triangles"),
+    ("nothing.xyz", "nothing.xyz: no such file"), (".", ".: is a directory"), ("box.txt", "box.txt: is no scene file"),
+    ("empty.toml", "empty.toml: the scene has no shapes"), ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: has no triangles"),
 ])
-@pytest.mark.parametrize("command", ["render", "info", "validate"])
+@pytest.mark.parametrize("command", ["render", "validate"])
 def test_a_wrong_scene(command: str, scene: str, message: str) -> None:
     for name in ("box.txt", "empty.toml", "empty.obj"):
         Path(name).write_text("")
@@ -286,54 +208,7 @@ def test_what_is_found_late_names_the_scene_and_leaves_the_old_picture() -> None
     assert new_files() == {"bad.png"} and Path("bad.png").read_bytes() == b"old"
 
 
-def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*arguments: Any) -> None:
-        raise MemoryError("Unable to allocate 9 GiB")
-
-    monkeypatch.setattr("wrt.renderer.render.prepare", fail)
-    refused(run("render", "box.obj"), "not enough memory: Unable to allocate 9 GiB")
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])
-def test_a_full_disk(name: str) -> None:
-    size = ("--size", "128x128", "--spp", 1)
-    assert run("render", "box.obj", *size, "-o", name).code == 0  # compile before the file size is limited
-    whole = Path(name).read_bytes()
-    with largest_file(min(4096, len(whole) // 2)):
-        refused(run("render", "box.obj", *size, "-o", name, "--seed", 1), f"error: {name}: cannot be written: ")
-        refused(run("render", "box.obj", *size, "-o", f"new-{name}"), f"error: new-{name}: cannot be written: ")
-    assert Path(name).read_bytes() == whole and new_files() == {name}
-
-
-def test_layers_of_a_picture_do_not_take_it_with_them_where_the_disk_is_full() -> None:
-    options = ("--size", "64x64", "--spp", 1, "--aov", "normal", "-o", "a.png")
-    assert run("render", "box.obj", *options, "--tonemap", "none", "--exposure", -100).code == 0
-    sizes = {name: Path(name).stat().st_size for name in new_files()}
-    assert sizes["a.png"] < sizes["a.normal.png"]  # a black picture is small
-    for name in sizes:
-        Path(name).unlink()
-    with largest_file(sizes["a.png"] + 16):
-        refused(run("render", "box.obj", *options, "--exposure", -100), "error: a.normal.png: cannot be written: ")
-    assert new_files() == {"a.png"} and read_image("a.png").shape == (64, 64, 3)
-
-
-def test_warnings_while_writing_are_told_like_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    def spoiled(*arguments: Any) -> Any:
-        film = film_of(*arguments)
-        film.pixels[0, 0] = np.nan
-        return film
-
-    monkeypatch.setattr("wrt.renderer.schedule.film_of", spoiled)
-    result = run("render", "box.obj", *SMALL, "-o", "a.png")
-    assert result.code == 0 and "warning: a.png: 1 pixel NaN or infinite, written as black or white\n" in result.err
-    assert "SceneWarning" not in result.err
-    assert run("render", "box.obj", *SMALL, "-o", "a.png", "-q").err == ""
-
-
-@pytest.mark.parametrize("command", [
-    ("info",), ("validate",), ("compile",), ("render", *SMALL), ("profile", *SMALL), ("build", "-o", "b\x1b[31m.accel"),
-    ("animate", "--frames", 1, *SMALL, "-o", "b\x07.gif"),
-], ids=lambda command: command[0])
+@pytest.mark.parametrize("command", [("info",), ("render", *SMALL), ("build", "-o", "b\x1b[31m.accel")], ids=lambda command: command[0])
 def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, ...]) -> None:
     name = "a\x1b[31mred\x07\x9b.obj"
     Path(name).write_bytes(Path("box.obj").read_bytes())
@@ -343,94 +218,11 @@ def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, .
     assert "\\x1b" in result.out or "\\x07" in result.out
 
 
-# --- Ctrl-C -----------------------------------------------------------------------------------------------------------
-
-
-def report_with(action: Callable[[Progress], None]) -> Callable[[bool], Any]:
-    """Return a progress_reporter that calls `action` at every report."""
-
-    @contextmanager
-    def reporter(quiet: bool) -> Iterator[Callable[[Progress], None]]:
-        yield action
-
-    return reporter
-
-
-def interrupt(progress: Progress) -> None:
-    if progress.done:
-        for _ in range(3):  # an impatient user
-            signal.raise_signal(signal.SIGINT)
-
-
-def test_ctrl_c_keeps_the_picture_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_module, "progress_reporter", report_with(interrupt))
-    result = run("render", "box.obj", "--size", "160x90", "--spp", 100000, "-o", "a.exr")
-    assert (result.code, result.out) == (130, "a.exr\n") and "(interrupted" in result.err
-    samples = read_channels("a.exr")["samples"]
-    assert samples.shape == (90, 160) and 0 < samples.max() <= samples.min() + 1 and samples.max() < 100000
-    assert new_files() == {"a.exr"} and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])
-def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def hurried(self: film_module.Film, *arguments: Any, **options: Any) -> list[Path]:
-        signal.raise_signal(signal.SIGINT)
-        paths = save(self, *arguments, **options)
-        signal.raise_signal(signal.SIGINT)
-        return paths
-
-    save = film_module.Film.save
-    assert run("render", "box.obj", *SMALL, "-o", f"expected-{name}").code == 0
-    monkeypatch.setattr(film_module.Film, "save", hurried)
-    result = run("render", "box.obj", *SMALL, "-o", name)
-    assert (result.code, result.out) == (130, f"{name}\n") and new_files() == {name, f"expected-{name}"}
-    assert np.array_equal(read_image(name), read_image(f"expected-{name}"))
-
-
-@pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.prepare.upload_scene",
-                                   "wrt.renderer.schedule.Run._trace_aovs"])
-def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("box.png").write_bytes(b"old")
-    monkeypatch.setattr(where, lambda *arguments, **options: signal.raise_signal(signal.SIGINT) or {})
-    result = run("render", "box.obj", *SMALL, "--aov", "depth")
-    assert result.code == 130 and result.out == "" and result.err.split("\n")[-2] == "interrupted"
-    assert "Traceback" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
-
-
 def test_a_width_alone_keeps_the_scenes_aspect_ratio() -> None:
     Path("scene.toml").write_text(TWO_CAMERAS + "[settings]\nsize = [60, 20]\nspp = 1\n")
     assert run("render", "scene.toml", "--size", 31, "-o", "a.jpg").code == 0
     with Image.open("a.jpg") as image:
         assert image.size == (31, 10) and image.format == "JPEG" and "wrt:spp=1" in image.getexif()[0x010E]
-
-
-def test_a_picture_on_stdout_is_the_file_and_nothing_else() -> None:
-    assert run("render", "box.obj", *SMALL, "-o", "a.png").code == 0
-    piped = subprocess.run([sys.executable, "-m", "wrt", "render", "box.obj", *map(str, SMALL), "-o", "-"], capture_output=True, check=True)
-    Path("piped.png").write_bytes(piped.stdout)
-    assert piped.stdout.startswith(b"\x89PNG") and piped.stdout.endswith(b"IEND\xaeB`\x82")
-    assert np.array_equal(read_image("piped.png"), read_image("a.png")) and not Path("-").exists()
-    closed = subprocess.run([sys.executable, "-m", "wrt", "render", "box.obj", "-o", "-"], stderr=subprocess.PIPE, text=True,
-                            preexec_fn=lambda: os.close(1))
-    assert closed.returncode == 2 and closed.stderr == "error: -o - is stdout, which is closed; give -o a file name\n"
-
-
-def test_a_watched_scene_is_rendered_after_each_change_and_mistakes_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    path, seen = Path("scene.toml"), []
-    path.write_text("1")
-
-    def make() -> None:
-        seen.append(path.read_text())
-        if len(seen) == 3:
-            raise KeyboardInterrupt
-        path.write_text(f"{seen[-1]} and a change")
-        if len(seen) == 1:
-            raise InputError("is half edited", path=path)
-
-    watched(path, make, quiet=False)
-    assert seen == ["1", "1 and a change", "1 and a change and a change"]
-    assert "error: scene.toml: is half edited" in capsys.readouterr().err
-    refused(run("render", "box.obj", "--watch", "-o", "-"), "--watch")
 
 
 # --- the other commands -----------------------------------------------------------------------------------------------
@@ -446,14 +238,6 @@ def test_info_tells_what_is_on_and_what_is_off() -> None:
     assert facts["features off"].split(", ") == [name for name, on in on_off.items() if not on]
     told = strict_json(run("info", "scene.toml", "--json").out)
     assert told["features"] == on_off and told["bounds_low"] == [-1, -1, -1] and told["bounds_high"] == [1, 1, 1]
-
-
-def test_info_of_a_scene_without_shapes() -> None:
-    Path("scene.toml").write_text('[background]\ntype = "gradient"\n[cameras.a]\nposition = [0, 0, 5]\ntarget = [0, 0, 0]\n')
-    result = run("info", "scene.toml")
-    assert result.code == 0 and "bounds_low: none\n" in result.out and "materials: none\n" in result.out
-    assert strict_json(run("info", "scene.toml", "--json").out)["bounds_low"] is None
-    assert run("render", "scene.toml", *SMALL).code == 0
 
 
 def test_schema_is_the_json_schema() -> None:
@@ -503,18 +287,13 @@ def test_compare_sees_where_a_crop_lies() -> None:
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: is no image file"),
-    (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),
-    (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png: a picture of the difference"),
-    (["a.exr", "a.exr", "-o", "nowhere/d.png"], "its folder does not exist"),
+    (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png"),
     (["a.exr", "a.exr", "--tonemap", "nope"], "tonemap must be one of"),
-    (["a.exr", "a.exr", "--exposure", "nan"], "exposure must be finite"),
-    (["a.exr", "a.exr", "--exposure", "1e30"], "exposure must be finite"),
     (["a.exr", "a.exr", "--max-mse", "little"], "'--max-mse'"), (["a.exr"], "Missing argument"),
 ], ids=str)
 def test_compare_refuses(arguments: list[str], message: str) -> None:
     write_image("a.exr", np.ones((20, 30, 3)))
     write_image("small.exr", np.ones((4, 8, 3)))
-    Path("broken.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     refused(run("compare", *arguments), message)
     assert not Path("d.exr").exists() and not Path("d.png").exists()
 
@@ -565,15 +344,10 @@ def test_a_process_renders() -> None:
     assert [line.split()[0] for line in result.err.splitlines()] == ["warning:", "2", "seconds:"]  # and no message of Warp
 
 
-def test_a_process_refuses() -> None:
-    refused(finish(process("render", "nothing.obj")), "error: nothing.obj: no such file")
-    refused(finish(process("render", "box.obj", "--device", "cuda:99")), "error: no device 'cuda:99'")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
 @pytest.mark.parametrize(("redirection", "code", "out", "err"), [
     ("2>&-", 0, "box.png\n", ""), (">&-", 0, "", "seconds"), (">&- 2>&-", 0, "", ""), ("<&-", 0, "box.png\n", "seconds"),
-    (">/dev/full", 2, "", "error: stdout: No space left on device"),
+    (">/dev/full", 2, "", "No space left on device"),
 ])
 def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str) -> None:
     if "full" in redirection and not Path("/dev/full").is_char_device():
@@ -610,30 +384,17 @@ def test_a_structure_in_a_file_holds_its_mesh() -> None:
 AT_ONCE = "import wrt.renderer.progress; wrt.renderer.progress.LINE_EVERY = 0.0"
 
 
-@pytest.mark.parametrize("times", [1, 5])
-def test_a_process_that_is_interrupted_writes_what_it_has(times: int) -> None:
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 1), (signal.SIGINT, 5), (signal.SIGTERM, 1), (signal.SIGHUP, 1)])
+def test_a_process_that_is_interrupted_writes_what_it_has(number: int, times: int) -> None:
     running = process("render", "box.obj", "--size", "320x180", "--spp", 1 << 24, "-o", "a.exr", "--aov", "depth", code=AT_ONCE)
     assert running.stderr is not None
     assert any("Mray/s" in line for line in running.stderr)
     for _ in range(times):
-        running.send_signal(signal.SIGINT)
+        running.send_signal(number)
     result = finish(running)
-    assert (result.code, result.out) == (130, "a.exr\n") and "(interrupted" in result.err and "Traceback" not in result.err
+    assert (result.code, result.out) == (128 + number, "a.exr\n") and "(interrupted" in result.err and "Traceback" not in result.err
     samples = read_channels("a.exr")["samples"]
     assert samples.shape == (180, 320) and samples.max() - samples.min() <= 64 and 0 < samples.max() < 1 << 24
-    assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
-
-
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_process_that_is_ended_writes_what_it_has(name: str) -> None:
-    number = getattr(signal, name)
-    running = process("render", "box.obj", "--size", "320x180", "--spp", 1 << 24, "-o", "a.exr", "--json", code=AT_ONCE)
-    assert running.stderr is not None
-    assert any("Mray/s" in line for line in running.stderr)
-    running.send_signal(number)
-    result = finish(running)
-    assert result.code == 128 + number and "(interrupted" in result.err and "Traceback" not in result.err
-    assert strict_json(result.out).items() >= {"interrupted": True, "signal": number}.items()
     assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
 
 
@@ -662,9 +423,8 @@ wrt.renderer.prepare.load_kernel = reported
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("code", [LOADING, COMPILING], ids=["loading", "compiling"])
-def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, number: int, folder: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, LOADING), (signal.SIGTERM, COMPILING)], ids=["loading", "compiling"])
+def test_a_process_that_is_interrupted_early_leaves_nothing(number: int, code: str, folder: Path) -> None:
     cold = {"WARP_CACHE_PATH": str(folder / "cache")}  # an empty cache, so that kernels are compiled
     running = process("render", "box.obj", "-o", "a.png", "--spp", 1 << 24, code=code, environment=cold)
     assert running.stderr is not None

@@ -1,4 +1,6 @@
-"""What all measuring commands share: the formats of reports, the time left, and what Ctrl-C keeps. This module is the study of a plan."""
+"""What all measuring commands share: options of a plan, --quick, formats of reports, the time left, and what Ctrl-C keeps.
+
+This module is the study of a plan."""
 
 from __future__ import annotations
 
@@ -18,7 +20,12 @@ from click.testing import CliRunner
 from wrt.cli.reporting import measured
 from wrt.core.interrupts import Interrupted
 from wrt.lab import Plan, option
+from wrt.lab.bench import Error, Pictures, Queries, Visibility
 from wrt.lab.bench.report import Columns, Groups, Row
+from wrt.lab.claims import Claims
+from wrt.lab.hard_cases import Closed, Stability
+from wrt.lab.mitsuba import Mitsuba
+from wrt.lab.rtcore import RtCore, WhatIf
 
 TITLE, LEGEND = "Squares", "square: the number times itself."
 COLUMNS: Columns = {"number": "{number}", "square": "{square}"}
@@ -28,19 +35,12 @@ COLUMNS: Columns = {"number": "{number}", "square": "{square}"}
 class Squares(Plan):
     """Square the numbers below COUNT."""
 
-    COMMAND, STUDY = "bench squares", __name__
+    COMMAND, STUDY, QUICK = "bench squares", __name__, {"count": 1}
     count: int = option(3, "How many numbers", (1, 100))
     files: Sequence[str] = option((), "Files, which must not change")
 
 
-measured_numbers: list[int] = []  # by all runs of a test
 stop_before = [100]  # the number before which SIGTERM comes
-
-
-@pytest.fixture(autouse=True)
-def _no_runs_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured_numbers.clear()
-    stop_before[0] = 100
 
 
 def groups(plan: Squares) -> Groups:
@@ -53,7 +53,6 @@ def groups(plan: Squares) -> Groups:
 def square_rows(numbers: Sequence[int]) -> list[Row]:
     if numbers[0] >= stop_before[0]:
         raise Interrupted(15)
-    measured_numbers.extend(numbers)
     return [Row(number=number, square=number**2, detail={"halves": [number / 2] * 2, "odd": bool(number % 2)},
                 pair=(number, np.float64(0.1)), share=math.nan, inner=Row(largest=math.inf, array=np.arange(3.0)), _hidden="x")
             for number in numbers]
@@ -65,9 +64,9 @@ def run(*arguments: object, stop: int = 100) -> Any:
 
 
 def test_a_table_can_be_read_by_other_programs(tmp_path: Path) -> None:
-    assert run("-o", tmp_path / "a.csv").exit_code == 0
+    assert run("--files", "a,b", "--files", "c", "-o", tmp_path / "a.csv").exit_code == 0
     lines = (tmp_path / "a.csv").read_text().splitlines()
-    assert lines[0] == "# command: python -m wrt bench squares --count 3" and lines[1].startswith("# machine: ")
+    assert lines[0] == "# command: python -m wrt bench squares --count 3 --files a,b,c" and lines[1].startswith("# machine: ")
     found = list(csv.DictReader(lines[2:]))[2]
     assert (found["number"], found["square"], found["detail.halves"], found["detail.odd"]) == ("2", "4", "[1.0, 1.0]", "False")
     run("-o", tmp_path / "a.json")
@@ -93,4 +92,18 @@ def test_ctrl_c_keeps_the_finished_rows(tmp_path: Path) -> None:
 def test_progress_tells_the_time_left() -> None:
     """Of four groups, the first is empty and the others have 2, 2 and 1 rows."""
     lines = [line for line in run("--count", 5).output.splitlines() if "of 4" in line]
-    assert [line.split("(")[1][:6] for line in lines] == ["2 of 4", "2 of 4", "3 of 4", "3 of 4"] and all("left" in line for line in lines)
+    assert [line.split("(")[1][:6] for line in lines] == ["1 of 4", "2 of 4", "2 of 4", "3 of 4", "3 of 4"]
+    assert all("left" in line for line in lines)
+
+
+def test_quick_lists_its_smaller_defaults_and_keeps_stated_options() -> None:
+    done = run("--quick", "-q")
+    assert done.stderr == "squares --quick: count 1 instead of 3\n" and "--count 1`" in done.stdout
+    assert "no effect" in run("--quick", "--count", 2).stderr
+
+
+@pytest.mark.parametrize("plan", [Queries, Visibility, Closed, Claims, Error, Pictures, Stability, Mitsuba, RtCore, WhatIf])
+def test_quick_is_less_than_the_default(plan: Any) -> None:
+    defaults = {name: plan.__dataclass_fields__[name].default for name in plan.QUICK}
+    assert all(plan.QUICK[name] < default for name, default in defaults.items() if not isinstance(default, str | tuple))
+    assert any(plan.QUICK[name] != default for name, default in defaults.items())

@@ -16,9 +16,8 @@ from tests.data import ROOT
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.accel.scenes.build import build, load_accel
-from wrt.cli.reporting import Reporting
 from wrt.core.errors import InputError
-from wrt.core.files import check_writable, read_file, replacing
+from wrt.core.files import check_writable, read_file, replacing, write_bytes
 from wrt.io.load import load_scene
 from wrt.picture.image import read_image, write_codes, write_image
 from wrt.renderer.animate import save_movie
@@ -31,7 +30,7 @@ WRITERS = {
     "a.png": lambda path: write_image(path, PIXELS), "a.exr": lambda path: write_image(path, PIXELS),
     "a.hdr": lambda path: write_image(path, PIXELS), "a.accel": lambda path: build(icosphere(0)).save(path),
     "a.gif": lambda path: save_movie(path, [np.zeros((4, 4, 3), np.uint8)] * 2, 10.0),
-    "a.md": lambda path: Reporting(output=path).write("text" * 10),
+    "a.md": lambda path: write_bytes(path, b"text" * 10),
     "a.checkpoint": lambda path: render(SCENE, spp=1, checkpoint=path, resume=True),
 }
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from typing import Any
 
-from wrt.lab import STRUCTURES, Plan, option, the_device, the_meshes, the_seed
+from wrt.lab import STRUCTURES, OnScene, Plan, option, the_device, the_meshes, the_seed, the_threads
 
 QUERY_KINDS = ("primary", "shadow", "diffuse", "random", "inward", "points", "tiles")
 THREAD_CHOICES = ("one", "all", "both")
@@ -20,7 +20,6 @@ class Queries(Plan):
 
     COMMAND, STUDY = "bench queries", "wrt.lab.bench.queries"
     QUICK = {"contestants": ("bvh8", "bvh2", "warp"), "number": 20_000, "runs": 3}
-    OUTPUT = "Write the tables as Markdown (.md), the rows as .csv or .json, or a bar chart as .svg or .png"
     contestants: Sequence[str] = option(())
     meshes: Sequence[Any] = option((), "Mesh files  [default: a terrain of 18,432 triangles]")
     rays: Sequence[str] = option(QUERY_KINDS[:4], "Kinds of queries: primary, shadow, diffuse, random and inward rays; points: closest"
@@ -75,16 +74,19 @@ class Pictures(Plan):
 
 
 @dataclass(frozen=True)
-class Error(Plan):
-    """Settings to vary in a study of error, and how often each picture is rendered."""
+class Error(OnScene):
+    """Render SCENE with various values of each setting. Compare time and error of the pictures with a converged reference."""
 
-    QUICK = {"max_spp": 4, "repeats": 3}
+    COMMAND, STUDY, QUICK = "bench error", "wrt.lab.bench.error", {"max_spp": 4, "repeats": 3}
     knobs: Sequence[str] = option((), "Settings to vary: sampler, max_depth, triangle, ... (an unknown name lists them)  [default: all]",
                                   of=("knob", "wrt.lab.bench.error:KNOBS"))
     max_spp: int = option(64, "Largest number of samples per pixel, after 1, 2, 4, ...", (1, 1 << 16))
     repeats: int = option(8, "Seeds for each picture; their spread gives the confidence intervals", (3, 1000))  # 2 seeds have no spread
     reference_spp: int | None = option(None, "Samples per pixel of 8 reference pictures each  [default: 8 times --max-spp]", (1, 1 << 24))
     row_limit: float = option(120.0, "Leave out a picture whose seeds together would take longer than this time  [default: 120s]")
+    seed: int = the_seed()
+    device: str = the_device()
+    threads: int | None = the_threads()
 
     @property
     def levels(self) -> list[int]:

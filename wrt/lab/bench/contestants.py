@@ -3,7 +3,6 @@
 A contestant is named by a structure or a library, with options after colons: "bvh8", "bvh2:builder=sweep", "bvh8:triangle=plane",
 "embree:mode=fast". Structures have the options of `wrt.build`. Installed packages add libraries by entry points (`wrt.contestants`)."""
 
-import ast
 import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +18,7 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.accel.snapshot import check_units
 from wrt.accel.structures import ACCELERATORS, options_of
-from wrt.core.checks import as_choice, require_known
+from wrt.core.checks import as_choice, assigned, require_known
 from wrt.core.device import load_kernel, start
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -365,15 +364,7 @@ def contestant(name: str, device: str = DEFAULT_DEVICE) -> Contestant:
     """Return the contestant that a name means. Raise InputError for an unknown name, option or value."""
     kind, *words = name.split(":")
     require_known(kind, [*ACCELERATORS, *LIBRARIES], "contestant", "contestants")
-    options: dict[str, Any] = {}
-    for word in words:
-        option, sign, text = word.partition("=")
-        if not sign:
-            raise InputError(f"{word!r} in {name} is not OPTION=VALUE", argument="contestants")
-        try:
-            options[option] = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            options[option] = text
+    options: dict[str, Any] = dict(assigned(words, "contestants"))
     return Own(kind, device, **options) if kind in ACCELERATORS else LIBRARIES[kind](device, **options)
 
 

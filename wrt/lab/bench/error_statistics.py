@@ -1,4 +1,4 @@
-"""Statistics of renders with several seeds: bias and noise with confidence intervals, slopes, and the Pareto front."""
+"""Statistics of renders with several seeds: bias and noise with confidence intervals, and slopes."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -95,15 +95,3 @@ def slope(spp: Sequence[int], errors: Callable[[np.ndarray], Sequence[float]], r
         return float(np.polyfit(np.log(spp), np.log(y), 1)[0]) if (y > 0.0).all() else math.nan
 
     return estimate(fit, repeats) if len(spp) >= 3 and not math.isnan(fit(np.arange(repeats))) else UNKNOWN
-
-
-def pareto_front(points: Sequence[tuple[float, float]], tolerance: float = 0.01) -> list[int]:
-    """Return the indices of the Pareto-optimal points (cost, error), by rising cost; skip points that are not finite.
-    A point of higher cost must lower the error by more than the share `tolerance`. So settings with equal error give one point.
-    Source: epsilon-dominance (Laumanns et al. 2002), applied to the error only."""
-    usable = [i for i, point in enumerate(points) if all(math.isfinite(x) for x in point)]
-    front: list[int] = []
-    for i in sorted(usable, key=lambda i: points[i]):
-        if not front or points[i][1] < (1.0 - tolerance) * points[front[-1]][1]:
-            front.append(i)
-    return front

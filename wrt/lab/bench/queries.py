@@ -22,7 +22,6 @@ from wrt.lab.bench import QUERY_KINDS
 from wrt.lab.bench import Queries as Plan
 from wrt.lab.bench.contestants import RAYS, RIVALS, Contestant, Own, contestant, installed
 from wrt.lab.bench.meshes import in_stadium, small_worlds, terrain
-from wrt.lab.bench.plot import bars
 from wrt.lab.bench.rays import RaySet, counters_of, inward, points_around, ray_sets, tiles
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate_on, peak_bytes, spread, with_seconds
@@ -272,21 +271,6 @@ def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         ratio = geometric_mean([row.first_over_it for row in group])
         out.setdefault(name if threads == 1 else f"{name}, {threads} threads", {})[kind] = ratio
     return out
-
-
-def chart(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
-    """Return a picture: a panel for each kind of query, a bar for each library in its best mode; fewest threads, geometric means over the
-    meshes."""
-    traced = [row for row in rows if "reason" not in vars(row)]
-    fewest = min(row.threads for row in traced)
-    panels: dict[str, dict[str, float]] = {}
-    for (kind, library), group in grouped([row for row in traced if row.threads == fewest], "kind", "library").items():
-        panels.setdefault(kind, {})[library] = geometric_mean([min(row.ns for row in modes) for modes in grouped(group, "mesh").values()])
-    where = f"{fewest} thread{'s' if fewest > 1 else ''}" if plan.device == "cpu" else plan.device
-    return bars(panels, f"Nanoseconds a ray or point; {where}; less is better", suffix)
-
-
-WRITERS = {".svg": chart, ".png": chart}
 
 
 def line(row: Row) -> str:

@@ -79,8 +79,7 @@ def study_of(plan: Plan) -> ModuleType:
 
     The module has TITLE, LEGEND, and groups(plan). It yields functions; each measures a group of Rows that are compared with each other.
     COLUMNS or parts(rows, plan) make the tables.
-    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, and
-    WRITERS for -o (see below)."""
+    Optional are machine(plan) for the report, line(row) for a line of progress, and facts(rows, plan) for more JSON fields."""
     return importlib.import_module(plan.STUDY)
 
 
@@ -126,7 +125,7 @@ def data(rows: Sequence[Row], plan: Plan) -> JsonObject:
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
 
-def csv_file(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
+def csv_text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
     """Return the rows as CSV, with lines that begin with # for the command and the machine. Columns are the fields in JSON.
 
     A field of a dictionary has the column "name.field". A list is a JSON text in one cell. A field that a row lacks is empty."""
@@ -137,7 +136,7 @@ def csv_file(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> byte
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(lines)
-    return text.getvalue().encode()
+    return text.getvalue()
 
 
 def flat(fields: Mapping[str, object], prefix: str = "") -> dict[str, object]:
@@ -149,10 +148,6 @@ def flat(fields: Mapping[str, object], prefix: str = "") -> dict[str, object]:
         else:
             out[prefix + name] = json.dumps(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
     return out
-
-
-# Formats of -o besides Markdown and JSON, by suffix: function(rows, plan, machine, suffix) -> contents of the file.
-WRITERS = {".csv": csv_file}
 
 
 def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:

@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -27,7 +28,7 @@ from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.lab.bench import error_statistics as statistics
 from wrt.lab.bench.error import REFERENCE_SEEDS, finished, make_reference
-from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, tabled
 from wrt.lab.bench.timing import quartiles, shown, spread
 from wrt.lab.mitsuba import Mitsuba as Plan
 from wrt.lab.mitsuba.translate import llvm_missing, mitsuba, translate
@@ -157,26 +158,30 @@ def render(spp: int, seed: int) -> tuple[float, np.ndarray]:
     return time.perf_counter() - begin, pixels
 
 
-def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
-        report: Callable[[str], None] = lambda line: None) -> Row:
-    """Measure wrt and Mitsuba. command: arguments of `python -m wrt` that render this scene at 1 spp; None: time no process.
+def groups(plan: Plan) -> Groups:
+    yield lambda: [compared(plan)]
+
+
+def compared(plan: Plan) -> Row:
+    """Measure wrt and Mitsuba. Whole processes are timed for a scene that is a file.
     Field not_available: unusable variant -> reason. Raise InputError if no variant is usable or Mitsuba cannot render the scene exactly."""
-    scene = scene.with_settings(filter="box")  # with other filters of Mitsuba a sample adds to several pixels
+    scene = plan.load().with_settings(filter="box")  # with other filters of Mitsuba a sample adds to several pixels
+    options, integrator = Options(camera=plan.camera), plan.integrator
+    if plan.matte:
+        scene, integrator = matte(scene), "direct" if integrator == "auto" else integrator
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
-    pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
+    pictures, starts = seeds[REFERENCE_SEEDS:], 0 if isinstance(plan.scene, Scene) else plan.starts
     threads, ours = thread_count(options.threads), []
     rivals: dict[str, Rival] = {}
     not_available: dict[str, str] = {}
     with ExitStack() as stack:
-        report("starting Mitsuba")
         for variant in dict.fromkeys(plan.variants):
             try:
-                rivals[variant] = stack.enter_context(Rival(Job(variant, scene, options.camera, plan.integrator, threads)))
+                rivals[variant] = stack.enter_context(Rival(Job(variant, scene, options.camera, integrator, threads)))
             except InputError as error:
                 not_available[variant] = str(error)
         if not rivals:
             raise InputError("; ".join(f"Mitsuba {variant}: {why}" for variant, why in not_available.items()))
-        report(f"reference: {REFERENCE_SEEDS} seeds")
         truth = make_reference(scene, options, plan.reference_spp or 8 * plan.spp, seeds[:REFERENCE_SEEDS], scene.settings.max_depth)
         renderer = Renderer(scene, options)
 
@@ -185,28 +190,28 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
             film = finished(renderer.run(seed=seed, spp=plan.spp)).pixels
             return time.perf_counter() - begin, film
 
-        report("pilot")
         target = statistics.mse_of(statistics.gram([our_picture(pictures[0])[1]], truth.pixels), truth.variance)
         require_error(target)
         for rival in rivals.values():
             rival.choose_spp(pictures[0], truth, target, plan.rival_limit)
         for turn, seed in enumerate(pictures):
-            report(f"picture {turn + 1} of {plan.repeats}")
             if turn % 2 == 0:
                 ours.append(our_picture(seed))
             for rival in rivals.values():
                 rival.runs.append(rival.render(rival.spp, seed))
             if turn % 2 == 1:
                 ours.append(our_picture(seed))
-        report("whole processes")
         for rival in rivals.values():
             rival.time_starts(starts)
     ready = renderer.prepared.seconds
     prepare = max(ready["compile"], ready["upload"] + ready["build"])  # these run in parallel
-    side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["render", str(plan.scene), "--spp", "1", "--size", plan.size, "-q", "-o", f"{folder}/start.png"]
+        whole = process_seconds(["-m", "wrt", *command, *(f"--set={word}" for word in plan.set)], starts)
+    side = side_of(plan.spp, ours, truth, prepare, whole)
     require_error(side.rmse)
     found = {variant: measured.result(side, truth) for variant, measured in rivals.items()}
-    return Row(scene=scene.name, size=scene.settings.size, integrator=plan.integrator, threads=threads, wrt=side, mitsuba=found,
+    return Row(scene=scene.name, size=scene.settings.size, integrator=integrator, threads=threads, wrt=side, mitsuba=found,
                not_available=not_available, reference=truth)
 
 
@@ -243,18 +248,23 @@ COLUMNS: Columns = {
     "process / wrt's": lambda side: known(side.process_ratio, "{:.3g}")}
 
 
-def text(result: Row) -> str:
-    """Return the report as Markdown."""
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    (result,) = rows
     sides = [Row(**vars(result.wrt), name="wrt", ratio=None, process_ratio=1.0),
              *(Row(**vars(rival), name=f"Mitsuba {variant}, {result.integrator}") for variant, rival in result.mitsuba.items())]
     width, height = result.size
-    notes = [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
+    notes = [f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}."]
+    notes += [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
     notes += [f"The picture of {variant} is not of the same light, so that its ratio has no meaning. Try --matte, or another --integrator."
              for variant, rival in result.mitsuba.items() if not rival.same_light]
-    head = f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}."
-    return markdown([tabled(COLUMNS, sides, "", head), Part("", "\n".join([LEGEND, *notes]))]).rstrip()
+    return [tabled(COLUMNS, sides, "", "\n".join(notes))]
 
 
+def line(row: Row) -> str:
+    return f"{row.scene}: {', '.join(f'{variant}: {shown(rival.ratio)}' for variant, rival in row.mitsuba.items())}"
+
+
+TITLE = "Time to equal error against Mitsuba"
 LEGEND = """\
 tracing / wrt's, process / wrt's: Mitsuba's time to reach wrt's error over wrt's time, for tracing alone (median [quartiles]) and for a
 whole process (start, imports, scene, structure, compiler). Kernels came from the caches on disk. Mitsuba traces with Embree in its robust

@@ -17,9 +17,8 @@ from tests.mitsuba_oracle import render_mitsuba
 from tests.refused import refused
 from wrt.lab.bench.report import Row
 from wrt.lab.mitsuba import VARIANTS, equal_error
-from wrt.lab.mitsuba.equal_error import Job, Plan, Rival, matte
+from wrt.lab.mitsuba.equal_error import Job, Plan, Rival, compared, matte
 from wrt.lab.mitsuba.translate import PATH_VARIABLE, llvm_missing
-from wrt.renderer.options import Options
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import PointLight
@@ -40,13 +39,17 @@ BALLS = Scene(
     spheres=(Sphere((0.0, 0.0, 0.0), 0.5, Material("glass", albedo=(0.9, 0.6, 0.9))), Sphere((0.7, 0.0, -0.5), 0.4, GREEN)),
     cameras=(Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov_y=0.8),), background=ConstantBackground((0.5, 1.0, 2.0)),
     settings=Settings(size=(24, 16), filter="box", min_throughput=0.0))
-PLAN = Plan(spp=8, repeats=3, reference_spp=64, rival_limit=1.0, starts=0)
+PLAN = Plan(ROOM, size="32x18", spp=8, repeats=3, reference_spp=64, rival_limit=1.0, starts=0)
 
 
 def measured(integrator: str, variant: str) -> Row:
     if variant == "llvm_ad_rgb" and (reason := llvm_missing()):
         pytest.skip(reason)
-    return equal_error.run(ROOM, replace(PLAN, integrator=integrator, variants=(variant,)), Options())
+    return compared(replace(PLAN, integrator=integrator, variants=(variant,)))
+
+
+def told(result: Row) -> str:
+    return equal_error.parts([result], PLAN)[0].text
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -59,27 +62,27 @@ def test_direct_light_is_the_same_and_the_ratio_is_its_own_definition(variant: s
     expected = np.median(np.array(rival.seconds) / np.array(result.wrt.seconds)) * (rival.rmse / result.wrt.rmse) ** 2
     assert rival.ratio[1] == pytest.approx(expected)
     assert 0.4 < rival.rmse / result.wrt.rmse < 2.5  # Mitsuba was given about as many samples as it needs.
-    assert math.isnan(rival.process_ratio) and "not of the same light" not in equal_error.text(result)
+    assert math.isnan(rival.process_ratio) and "not of the same light" not in told(result)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_interreflection_is_another_light(variant: str) -> None:
     result = measured("path", variant)
-    assert not result.mitsuba[variant].same_light and f"The picture of {variant} is not of the same light" in equal_error.text(result)
+    assert not result.mitsuba[variant].same_light and f"The picture of {variant} is not of the same light" in told(result)
 
 
 def test_a_variant_without_its_library_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PATH_VARIABLE, "/nowhere/libLLVM.so")
-    result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
+    result = compared(replace(PLAN, integrator="direct"))
     assert set(result.mitsuba) == {"scalar_rgb"} and "/nowhere/libLLVM.so" in result.not_available["llvm_ad_rgb"]
     with refused(what="Mitsuba llvm_ad_rgb"):
-        equal_error.run(ROOM, replace(PLAN, integrator="direct", variants=("llvm_ad_rgb",)), Options())
+        compared(replace(PLAN, integrator="direct", variants=("llvm_ad_rgb",)))
 
 
 def test_a_picture_without_error_has_nothing_to_be_equal_to() -> None:
     empty = Scene(cameras=ROOM.cameras, background=ConstantBackground((0.5, 0.5, 0.5)), settings=ROOM.settings)
     with refused(what="no error"):
-        equal_error.run(empty, replace(PLAN, variants=("scalar_rgb",)), Options())
+        compared(replace(PLAN, scene=empty, variants=("scalar_rgb",)))
 
 
 def test_a_process_renders_what_is_rendered_here_and_its_end_is_reported() -> None:
@@ -92,8 +95,7 @@ def test_a_process_renders_what_is_rendered_here_and_its_end_is_reported() -> No
 def test_starts_have_all_that_a_process_takes(tmp_path) -> None:
     scene = tmp_path / "room.toml"
     shutil.copy(ROOT / "scenes" / "independent.toml", scene)
-    command = ["render", str(scene), "--spp", "1", "--size", "8x8", "-q", "-o", str(tmp_path / "start.png")]
-    result = equal_error.run(ROOM, replace(PLAN, integrator="direct", starts=1, variants=("scalar_rgb",)), Options(), command)
+    result = compared(replace(PLAN, scene=scene, size="8x8", matte=True, starts=1, variants=("scalar_rgb",)))
     rival = result.mitsuba["scalar_rgb"]
     assert result.wrt.process_seconds > np.median(result.wrt.seconds) and rival.process_seconds > rival.prepare_seconds
     assert rival.process_ratio == pytest.approx(rival.process_seconds / result.wrt.process_seconds)
@@ -114,6 +116,6 @@ def test_the_command(tmp_path) -> None:
     done = command_line.wrt("bench", "mitsuba", ROOT / "scenes" / "independent.toml", "--matte", "--size", "16x9", "--spp", "4",
                             "--repeats", "3", "--starts", "0", "--rival-limit", "1s", "--json", "-q", "-o", output)
     assert done.code == 0, done.err
-    data = json.loads(done.out)
-    assert data["mitsuba"]["scalar_rgb"]["spp"] >= 1 and set(data["mitsuba"]) | set(data["not_available"]) == set(VARIANTS)
+    (row,) = json.loads(done.out)["rows"]
+    assert row["mitsuba"]["scalar_rgb"]["spp"] >= 1 and set(row["mitsuba"]) | set(row["not_available"]) == set(VARIANTS)
     assert "Mitsuba scalar_rgb, direct" in output.read_text()
