@@ -88,7 +88,7 @@ assert differ <= 1e-3 * raster.size  # pixels whose middle lies on an edge, with
 # own. `python -m wrt bench visibility` measures both with compiled code, and compares each pixel:
 
 # %%
-plan = visibility.Plan(meshes=(), size=64 if QUICK else 256, max_size=128 if QUICK else 1024, max_triangles=MOST, runs=RUNS)
+plan = visibility.Plan(size=64 if QUICK else 256, max_size=128 if QUICK else 1024, max_triangles=MOST, runs=RUNS)
 rows = [row for row in report.run(plan) if row.surface == "terrain"]
 assert all(row.differ <= 1e-3 * row.pixels for row in rows)
 fig, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), dpi=80, layout="constrained")

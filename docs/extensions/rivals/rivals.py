@@ -118,7 +118,7 @@ class EmbreePackets(FromC):
 
         return run
 
-    def occluded(self, out):
+    def result(self, out):
         return out[0] == -np.inf
 
 

@@ -45,19 +45,15 @@ class Queries(Plan):
 
 @dataclass(frozen=True)
 class Visibility(Plan):
-    """Compare rasterising with ray casting. As triangles and pixels grow: the time of both, and the pixels where they differ.
-
-    MESHES: mesh files; default: a sphere and a terrain."""
+    """Compare rasterising with ray casting. As triangles and pixels grow: the time of both, and the pixels where they differ."""
 
     COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
     QUICK = {"size": 128, "max_size": 512, "max_triangles": 50_000, "runs": 5}
-    meshes: Sequence[Any] = the_meshes()
     size: int = option(512, "Side of the square picture, in pixels, while the number of triangles grows", (1, 16384))
     max_size: int = option(1024, "Largest side, in pixels, of the sweep over picture sizes, which starts at 64", (64, 16384))
-    max_triangles: int = option(1_500_000, "Subdivide meshes up to this number of triangles", (1, 2**30))
+    max_triangles: int = option(1_500_000, "Subdivide surfaces up to this number of triangles", (1, 2**30))
     runs: int = option(7, "Timed runs of each method, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
-    device: str = the_device()
 
 
 @dataclass(frozen=True)

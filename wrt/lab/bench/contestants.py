@@ -45,7 +45,7 @@ class Contestant(ABC):
     queries: frozenset[str] = RAYS  # what it answers: closest, any, points, tiles
     has_threads = False  # `search` can use several threads
     on_gpu = False
-    bytes_per_triangle = float("nan")  # size of the structure
+    facts: dict[str, Any] = {}  # further fields of its rows in a report
 
     def __init__(self, device: str = DEFAULT_DEVICE, **options: Any) -> None:
         for option, value in options.items():
@@ -91,13 +91,9 @@ class Contestant(ABC):
         """Return the function to time: it answers the rays, with rays and results in the library's own arrays."""
         return lambda: self.closest(rays.origins, rays.directions, 0.0, rays.t_max)
 
-    def occluded(self, out: Any) -> np.ndarray:
-        """Return flags of the occluded rays. out: result of the function from search(), for any-hit rays."""
+    def result(self, out: Any) -> np.ndarray:
+        """Return flags of the occluded rays, distances to closest points, or t of tiles. out: result of the function from search()."""
         return out.prim_id >= 0 if isinstance(out, Hits) else np.asarray(out)
-
-    def lengths(self, out: Any) -> np.ndarray:
-        """Return distances to closest points, or t of tiles. out: result of the function from search()."""
-        return np.asarray(out)
 
 
 class Own(Contestant):
@@ -119,7 +115,6 @@ class Own(Contestant):
 
     def load(self, geometry: Geometry) -> None:
         self.accel: Any = build(geometry, self.NAME, self.device, **self.options)
-        self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
 
     def prepare(self, geometry: Geometry) -> bool:
         if not hasattr(self, "accel") or self.accel.geometry is not geometry:
@@ -143,11 +138,8 @@ class Own(Contestant):
         ask = accel.any_hit if rays.any_hit else accel.closest_hit
         return lambda: ask(origins, directions, 0.0, t_max, threads=threads, **world)
 
-    def occluded(self, out: Any) -> np.ndarray:
-        return np.asarray(out.numpy().astype(bool))
-
-    def lengths(self, out: Any) -> np.ndarray:
-        return np.asarray(out.t.numpy() if hasattr(out, "t") else out)
+    def result(self, out: Any) -> np.ndarray:
+        return np.asarray(out.t.numpy() if hasattr(out, "t") else out.numpy().astype(bool) if isinstance(out, wp.array) else out)
 
 
 class Embree(Contestant):
@@ -177,7 +169,7 @@ class Embree(Contestant):
             return lambda: self.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")
         return lambda: self.scene.run(o, d, query="INTERSECT")
 
-    def occluded(self, out: Any) -> np.ndarray:
+    def result(self, out: Any) -> np.ndarray:
         return np.asarray(out >= 0)
 
 
@@ -231,10 +223,7 @@ class WarpMesh(Contestant):
 
         return run
 
-    def occluded(self, out: Any) -> np.ndarray:
-        return np.asarray(out[0].numpy())
-
-    def lengths(self, out: Any) -> np.ndarray:
+    def result(self, out: Any) -> np.ndarray:
         return np.asarray(out[0].numpy())
 
 
@@ -272,8 +261,8 @@ class Open3D(Contestant):
         found = self.scene.compute_closest_points(self.tensor(points), nthreads=threads)["points"].numpy()
         return np.asarray(np.sqrt(((found.astype(np.float64) - points) ** 2).sum(axis=1)))
 
-    def occluded(self, out: Any) -> np.ndarray:
-        return np.asarray(out.numpy().astype(bool))
+    def result(self, out: Any) -> np.ndarray:
+        return np.asarray(out if isinstance(out, np.ndarray) else out.numpy().astype(bool))
 
 
 class Trimesh(Contestant):

@@ -1,7 +1,6 @@
 """`python -m wrt bench queries`: compare structures of wrt, and other libraries, on the same rays and points."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import cache, partial
 from itertools import product
 from statistics import geometric_mean
@@ -15,7 +14,6 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
-from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import QUERY_KINDS
@@ -24,7 +22,7 @@ from wrt.lab.bench.contestants import RAYS, RIVALS, Contestant, Own, contestant,
 from wrt.lab.bench.meshes import in_stadium, small_worlds, terrain
 from wrt.lab.bench.rays import RaySet, counters_of, inward, points_around, ray_sets, tiles
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
-from wrt.lab.bench.timing import alternate_on, peak_bytes, spread, with_seconds
+from wrt.lab.bench.timing import alternate_on, spread, with_seconds
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -51,34 +49,29 @@ def known(column: str | Callable[[Row], str]) -> Callable[[Row], str]:
 
 
 BUILT: Columns = {
-    "contestant": "{name}", "build s": lambda row: f"{np.median(row.build):.3g}",
-    "peak B/triangle": known(lambda row: f"{row.peak_bytes / row.triangles:.0f}"), "B/triangle": known("{bytes_per_triangle:.0f}"),
+    "contestant": "{name}", "build s": lambda row: f"{np.median(row.build):.3g}", "B/triangle": known("{bytes_per_triangle:.0f}"),
     "SAH cost": known("{sah_cost:.2f}"), "depth": known("{depth}"), "references/triangle": known("{references_per_triangle:.2f}")}
 TRACED: Columns = {
     "contestant": "{name}", "queries": "{kind}", "threads": "{threads}", "hit": "{hit:.0%}", "ns/query": "{ns:.3g}",
     "Mquery/s": lambda row: spread(row.mrays), "time / first": lambda row: spread(row.ratios), "nodes": known("{nodes:.2f}"),
     "leaves": known("{leaves:.2f}"), "boxes": known("{boxes:.2f}"), "triangles": known("{tests:.2f}"),
     "B fetched": known("{bytes:.0f}"), "differ": "{differ}", "wrong": known("{wrong} of {checked}")}
-REFUSED: Columns = {"contestant": "{name}", "mesh": "{mesh}", "reason": "{reason}"}
 LEGEND = f"""\
-build: median time of the builds, on all cores. peak B/triangle: growth of the process's memory at the first build. B/triangle: bytes of
-the structure, triangles included. SAH cost: nodes and triangles that a random line through the root's box is expected to visit.
-references: entries of all leaves. ns/query, Mquery/s: the thread's CPU seconds (wall-clock seconds for several threads and for a GPU),
-medians of alternating runs, with quartiles in brackets. A run on a GPU is 10 calls and one wait. Rays and results are in each library's
-own arrays. time / first: time over the first contestant's, run by run. nodes, leaves, boxes, triangles, B fetched: visited, tested or
-read for a closest hit. differ: answers that are not the first contestant's: a hit against a miss, or other primitives at t that differ
-by more than {SAME_T:g} relative. wrong: answers that are not those of brute force, for as many rays as {TESTS:.0e} tests allow; of wrt's
-structures bit for bit. inward: lines that meet the mesh's box. points: closest points; distances may differ by {SAME_T:g} relative.
-tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best: the fastest of a library's modes for each mesh."""
+build: median time of the builds, on all cores. B/triangle: bytes of the structure, triangles included. SAH cost: nodes and triangles that
+a random line through the root's box is expected to visit. references: entries of all leaves. ns/query, Mquery/s: the thread's CPU seconds
+(wall-clock seconds for several threads and for a GPU), medians of alternating runs, with quartiles in brackets. A run on a GPU is 10
+calls and one wait. Rays and results are in each library's own arrays. time / first: time over the first contestant's, run by run. nodes,
+leaves, boxes, triangles, B fetched: visited, tested or read for a closest hit. differ: answers that are not the first contestant's: a hit
+against a miss, or other primitives at t that differ by more than {SAME_T:g} relative. wrong: answers that are not those of brute force,
+for as many rays as {TESTS:.0e} tests allow; of wrt's structures bit for bit. inward: lines that meet the mesh's box. points: closest
+points; distances may differ by {SAME_T:g} relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best: the
+fastest of a library's modes for each mesh."""
 
 
 class Prepared(NamedTuple):
-    """A scene and its contestants. facts: fields of each contestant's rows; refused: rows with the reasons of the other contestants;
-    rays: kind of query -> its rays; geometry: of the mesh, or None for many worlds."""
+    """A scene and its contestants. rays: kind of query -> its rays; geometry: of the mesh, or None for many worlds."""
 
     contestants: list[Contestant]
-    facts: list[dict[str, Any]]
-    refused: list[Row]
     rays: dict[str, RaySet]
     geometry: Geometry | None = None
 
@@ -90,14 +83,13 @@ def names_of(plan: Plan) -> list[str]:
 
 
 def groups(plan: Plan) -> Groups:
-    """For each scene, yield the group of the contestants that refuse it, then a group for each kind of query and number of threads."""
+    """Yield a group for each mesh, kind of query and number of threads."""
     on_mesh = [kind for kind in QUERY_KINDS if kind in plan.rays and kind != "tiles"]
     for mesh in map(as_mesh, plan.meshes or [terrain(CELLS)]) if on_mesh else ():
         scene = in_stadium(mesh) if plan.stadium else mesh
-        name, ready = mesh_name(scene), cache(partial(with_mesh, plan, scene, mesh, on_mesh))
-        yield partial(refused_rows, name, ready)
+        ready = cache(partial(with_mesh, plan, scene, mesh, on_mesh))
         for kind, threads in product(on_mesh, thread_counts(plan)):
-            yield partial(kind_rows, plan, {"mesh": name, "triangles": len(scene.faces)}, ready, kind, threads)
+            yield partial(kind_rows, plan, {"mesh": mesh_name(scene), "triangles": len(scene.faces)}, ready, kind, threads)
     if "tiles" in plan.rays:
         worlds = small_worlds(plan.worlds, plan.seed)
         ready = cache(partial(with_worlds, plan, worlds))
@@ -118,24 +110,14 @@ def with_mesh(plan: Plan, mesh: Mesh, alone: Mesh, kinds: Sequence[str]) -> Prep
         rays["inward"] = inward(of_rays, plan.number, plan.seed)
     if "points" in kinds:
         rays["points"] = points_around(of_rays, plan.number, plan.seed)
-    out = Prepared([], [], [], rays, geometry)
-    for name in names_of(plan):
-        one = contestant(name, plan.device)
-        with suppress(InputError):  # a refusal is reported for the measured mesh
-            one.load(Geometry.of(icosphere(3)))  # compiles the builder's kernels
-        try:
-            first, peak = peak_bytes(partial(built, one, geometry))
-            seconds = [first, *(built(one, geometry) for _ in range(plan.builds - 1))]
-        except InputError as error:
-            out.refused.append(Row(name=one.name, reason=str(error)))
-            continue
-        facts: dict[str, Any] = {"build": seconds, "peak_bytes": peak}
+    out = Prepared([contestant(name, plan.device) for name in names_of(plan)], rays, geometry)
+    for one in out.contestants:
+        one.load(Geometry.of(icosphere(3)))  # compiles the builder's kernels
+        one.facts = {"build": [built(one, geometry) for _ in range(plan.builds)]}
         if isinstance(one, Own):
             stats = one.accel.stats
-            facts |= {"bytes_per_triangle": one.bytes_per_triangle, "sah_cost": stats.sah_cost, "depth": stats.depth,
-                      "references_per_triangle": stats.references / len(geometry)}
-        out.contestants.append(one)
-        out.facts.append(facts)
+            one.facts |= {"bytes_per_triangle": stats.bytes / len(geometry), "sah_cost": stats.sah_cost, "depth": stats.depth,
+                          "references_per_triangle": stats.references / len(geometry)}
     return out
 
 
@@ -148,21 +130,16 @@ def built(one: Contestant, geometry: Geometry) -> float:
 def with_worlds(plan: Plan, worlds: Sequence[Mesh]) -> Prepared:
     """Build the structures of the contestants that can answer tiles."""
     chosen = [one for one in (contestant(name, plan.device) for name in names_of(plan)) if "tiles" in one.queries]
-    facts = [{"build": [with_seconds(partial(one.load_worlds, worlds))[1]]} for one in chosen]
-    return Prepared(chosen, facts, [], {"tiles": tiles(len(worlds))})
-
-
-def refused_rows(mesh: str, ready: Callable[[], Prepared]) -> list[Row]:
-    return [Row(mesh=mesh, **vars(row)) for row in ready().refused]
+    for one in chosen:
+        one.facts = {"build": [with_seconds(partial(one.load_worlds, worlds))[1]]}
+    return Prepared(chosen, {"tiles": tiles(len(worlds))})
 
 
 def kind_rows(plan: Plan, subject: dict[str, Any], ready: Callable[[], Prepared], kind: str, threads: int) -> list[Row]:
     """Return a row for each contestant that answers this kind of query."""
     scene = ready()
     rays, query = scene.rays[kind], {"shadow": "any", "points": "points", "tiles": "tiles"}.get(kind, "closest")
-    places = [i for i, one in enumerate(scene.contestants)
-              if query in one.queries and (one.has_threads or threads == 1 or query in RAYS)]
-    chosen = [scene.contestants[i] for i in places]
+    chosen = [one for one in scene.contestants if query in one.queries and (one.has_threads or threads == 1 or query in RAYS)]
     searches = [searching(one, rays, threads) for one in chosen]
     answers = [answer(one, rays, search()) for one, search in zip(chosen, searches, strict=True)]
     clock = thread_time if threads == 1 and plan.device == "cpu" else perf_counter
@@ -173,7 +150,7 @@ def kind_rows(plan: Plan, subject: dict[str, Any], ready: Callable[[], Prepared]
         row = Row(**subject, name=one.name, library=one.FAMILY or one.name, kind=kind, rays=len(rays), threads=threads,
                   hit=hit_share(answers[0]), seconds=seconds[i].tolist(), mrays=mrays.tolist(), ratios=ratios.tolist(),
                   ns=1e9 * float(np.median(seconds[i])) / len(rays), mrays_median=float(np.median(mrays)),
-                  first_over_it=float(np.median(ratios)), differ=differing(answers[i], answers[0]), **scene.facts[places[i]])
+                  first_over_it=float(np.median(ratios)), differ=differing(answers[i], answers[0]), **one.facts)
         if scene.geometry is not None and query in RAYS:
             vars(row).update(wrong_answers(one, rays, scene.geometry))
             vars(row).update(steps(one, rays) if isinstance(one, Own) else {})
@@ -200,10 +177,8 @@ def searching(one: Contestant, rays: RaySet, threads: int) -> Callable[[], list[
 
 def answer(one: Contestant, rays: RaySet, out: list[object]) -> Hits | np.ndarray:
     """Return closest hits by a new query, flags of the occluded rays, or distances. out: result of the function from `searching`."""
-    if rays.any_hit:
-        return np.concatenate([one.occluded(part) for part in out])
-    if rays.kind in ("points", "tiles"):
-        return np.concatenate([one.lengths(part) for part in out])
+    if rays.any_hit or rays.kind in ("points", "tiles"):
+        return np.concatenate([one.result(part) for part in out])
     return one.closest(rays.origins, rays.directions, 0.0, rays.t_max)
 
 
@@ -242,18 +217,14 @@ def steps(one: Own, rays: RaySet) -> dict[str, float]:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return two tables for each mesh, then the contestants that refused a mesh, and means over the meshes."""
-    refused = [row for row in rows if "reason" in vars(row)]
-    traced = [row for row in rows if row not in refused]
+    """Return two tables for each mesh, and means over the meshes."""
     out = []
-    for (mesh, triangles), group in grouped(traced, "mesh", "triangles").items():
+    for (mesh, triangles), group in grouped(rows, "mesh", "triangles").items():
         first = [each[0] for each in grouped(group, "name").values()]
         out += [tabled(BUILT, first, f"{mesh}, {triangles} triangles"), tabled(TRACED, group)]
-    if refused:
-        out.append(tabled(REFUSED, refused, "Not built"))
-    kinds = list(dict.fromkeys(row.kind for row in traced))
-    lines = [(name, *(f"{by_kind[kind]:.2f}" if kind in by_kind else "" for kind in kinds)) for name, by_kind in means(traced).items()]
-    title = f"Geometric means over {len({row.mesh for row in traced if row.kind != 'tiles'})} meshes of time / first"
+    kinds = list(dict.fromkeys(row.kind for row in rows))
+    lines = [(name, *(f"{by_kind[kind]:.2f}" if kind in by_kind else "" for kind in kinds)) for name, by_kind in means(rows).items()]
+    title = f"Geometric means over {len({row.mesh for row in rows if row.kind != 'tiles'})} meshes of time / first"
     return [*out, *([Part(title, "", ("contestant", *kinds), lines)] if lines else [])]
 
 
@@ -274,8 +245,6 @@ def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def line(row: Row) -> str:
-    if "reason" in vars(row):
-        return f"{row.mesh}: {row.name}: {row.reason}"
     return f"{row.mesh}: {row.name}, {row.kind}, {row.threads} threads: {row.ns:.3g} ns, {row.differ} differ"
 
 
@@ -286,4 +255,4 @@ def machine(plan: Plan) -> str:
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    return {"means": means([row for row in rows if "reason" not in vars(row)])}
+    return {"means": means(rows)}

@@ -43,12 +43,6 @@ def counters_of(accel: Accelerator, rays: Any, trace: bool = False) -> Counters:
     return counters
 
 
-def mean_counters(accel: Accelerator, rays: RaySet, **names: str) -> dict[str, float]:
-    """Trace closest hits; return means of counters over the rays. names: key in the result = name of the counter."""
-    counters = counters_of(accel, rays)
-    return {name: float(getattr(counters, counter).mean()) for name, counter in names.items()}
-
-
 def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 

@@ -1,14 +1,8 @@
-"""Time several jobs by turns in one process, so that disturbances hit all of them alike; measure the peak of memory."""
+"""Time several jobs by turns in one process, so that disturbances hit all of them alike."""
 
-import ctypes
-import gc
-import math
-import re
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -63,30 +57,11 @@ def quartiles(values: npt.ArrayLike) -> Quartiles:
     return low, middle, high
 
 
-def shown(values: Quartiles, digits: int = 3) -> str:
+def shown(values: Quartiles) -> str:
     """Format quartiles as the median, with the first and third quartile in brackets."""
-    return f"{values[1]:.{digits}g} [{values[0]:.{digits}g}, {values[2]:.{digits}g}]"
+    return f"{values[1]:.3g} [{values[0]:.3g}, {values[2]:.3g}]"
 
 
 def spread(values: npt.ArrayLike, scale: float = 1.0) -> str:
     """Format the median and quartiles of the values, each multiplied by `scale`."""
     return shown(quartiles(scale * np.asarray(values)))
-
-
-def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
-    """Return the result of `work`, and the growth of the process's peak memory in bytes (Linux; else NaN).
-    Before, return freed memory to the system as far as possible: memory that `work` reuses would not show as growth."""
-    gc.collect()
-    with suppress(AttributeError, OSError, TypeError):  # no malloc_trim, or Windows, where CDLL needs a name
-        ctypes.CDLL(None).malloc_trim(0)
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # reset the peak
-    except OSError:
-        return work(), math.nan
-    before = _peak()
-    return work(), max(_peak() - before, 0.0)
-
-
-def _peak() -> float:
-    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return 1024.0 * float(found[1]) if found else math.nan

@@ -2,9 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -13,7 +11,6 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.core.device import launch_on, load_kernel, start, upload
 from wrt.core.errors import InputError
-from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.rasterize import rasterize
 from wrt.lab.bench import Visibility as Plan
 from wrt.lab.bench.meshes import terrain
@@ -21,10 +18,7 @@ from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_li
 from wrt.lab.bench.timing import alternate, spread
 from wrt.renderer.upload import camera_rays, camera_struct
 from wrt.scene.cameras import Camera
-from wrt.scene.defaults import frame_camera
-from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
-from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
 Picture = tuple[np.ndarray, np.ndarray]  # depth along the ray (inf on a miss), and prim_id (-1): (pixels,) each
@@ -32,19 +26,22 @@ NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # key of a pixel without a triangle: d
 SAME_DEPTH = 1e-5  # largest relative difference of depth at which two triangles are a tie
 MIN_SIDE = 64  # pixels; the sweep over picture sizes starts here and doubles the side
 SWEEP_TRIANGLES = 80_000  # about the triangles of the mesh in the sweep over picture sizes
-SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions of an icosphere; cells a side of a terrain
+# Surface -> its meshes of growing numbers of triangles, as functions, and the camera of square pictures.
+SURFACES: dict[str, tuple[list[Callable[[], Mesh]], Camera]] = {
+    "sphere": ([partial(icosphere, n) for n in range(3, 10)], Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))),
+    "terrain": ([partial(terrain, 22 * 2**n) for n in range(8)],
+                Camera.look_at((0.0, 0.9, 1.2), (0.0, -0.3, -0.2), fov_y=math.radians(60.0)))}
 TITLE = "Rasterising against ray casting"
 COLUMNS: Columns = {
-    "surface": lambda row: Path(row.surface).name, "triangles": "{triangles}", "pixels": "{pixels}",
-    "covered": lambda row: f"{row.covered / row.pixels:.1%}", "raster ms": lambda row: spread(row.raster, 1e3),
-    "cast ms": lambda row: spread(row.cast, 1e3), "build ms": lambda row: f"{1e3 * row.build:.3g}",
+    "surface": "{surface}", "triangles": "{triangles}", "pixels": "{pixels}", "covered": lambda row: f"{row.covered / row.pixels:.1%}",
+    "raster ms": lambda row: spread(row.raster, 1e3), "cast ms": lambda row: spread(row.cast, 1e3),
+    "build ms": lambda row: f"{1e3 * row.build:.3g}",
     "cast / raster": lambda row: spread(np.array(row.cast) / np.array(row.raster)), "differ": "{differ}", "ties": "{ties}"}
-EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}", "exponent": "{exponent:.3f}"}
 LEGEND = f"""\
 covered: pixels with a triangle. raster: time of a z-buffer over all triangles. cast: time of one ray a pixel; rays and structure are made
 beforehand. build: time to build that structure. Both on one thread of a CPU. Medians of alternating runs, quartiles in brackets, ratios
 run by run. cast / raster: above 1 rasterising is faster. differ: pixels whose prim_id differs. ties: pixels among them at the same depth,
-within {SAME_DEPTH:g} relative; at the others the centre lies on an outline, within a rounding error. exponent: seconds ~ n^exponent."""
+within {SAME_DEPTH:g} relative; at the others the centre lies on an outline, within a rounding error."""
 
 
 def rasterizer(geometry: Geometry, camera: Camera, side: int, device: str = "cpu") -> Callable[[], Picture]:
@@ -69,10 +66,9 @@ def rasterizer(geometry: Geometry, camera: Camera, side: int, device: str = "cpu
     return draw
 
 
-def ray_caster(geometry: Geometry, camera: Camera, side: int, accel: str = "bvh",
-               device: str = "cpu") -> tuple[Callable[[], Picture], float]:
+def ray_caster(geometry: Geometry, camera: Camera, side: int, accel: str = "bvh") -> tuple[Callable[[], Picture], float]:
     """Return a function that casts a ray through the centre of each pixel, and the seconds to build its structure."""
-    structure = build(geometry, accel, device)
+    structure = build(geometry, accel)
     origins, directions = (wp.array(rows, dtype=wp.vec3, device=structure.device) for rows in camera_rays(camera, (side, side)))
 
     def draw() -> Picture:
@@ -90,79 +86,37 @@ def compared(raster: Picture, cast: Picture) -> dict[str, int]:
     return {"covered": int((raster[1] >= 0).sum()), "differ": int(differ.sum()), "ties": int((differ & close & np.isfinite(cast[0])).sum())}
 
 
-def subdivided(mesh: Mesh) -> Mesh:
-    """Cut each triangle into four at the midpoints of its sides; the result has no vertex normals."""
-    from trimesh.remesh import subdivide
-
-    vertices, faces = subdivide(mesh.vertices.astype(np.float64), mesh.faces)
-    return Mesh(vertices, faces, name=mesh.name)
-
-
-@dataclass(frozen=True)
-class Surface:
-    """One shape as meshes of growing numbers of triangles, and its camera for square pictures."""
-
-    name: str
-    meshes: list[Mesh]
-    camera: Camera
-
-
-def surfaces(plan: Plan) -> Iterator[Surface]:
-    """Yield each surface with its meshes of up to plan.max_triangles triangles. The coarsest mesh may have more."""
-    for path in plan.meshes:
-        mesh = as_mesh(path)
-        finer = [replace(mesh, normals=None)]
-        while 4 * len(finer[-1].faces) <= plan.max_triangles:
-            finer.append(subdivided(finer[-1]))
-        yield Surface(str(path), finer, framing(mesh))
-    if not plan.meshes:
-        balls = [icosphere(n) for n in SPHERES if n == SPHERES[0] or 20 * 4**n <= plan.max_triangles]
-        yield Surface("sphere", balls, framing(balls[0]))
-        hills = [terrain(n) for n in TERRAINS if n == TERRAINS[0] or 2 * n * n <= plan.max_triangles]
-        yield Surface("terrain", hills, Camera.look_at((0.0, 0.9, 1.2), (0.0, -0.3, -0.2), fov_y=math.radians(60.0)))
-
-
-def framing(mesh: Mesh) -> Camera:
-    return frame_camera(Scene(objects=(Object(mesh, (Material(),)),)))
-
-
 def groups(plan: Plan) -> Groups:
+    """Yield a group for each surface and size. The coarsest mesh may have more than plan.max_triangles triangles."""
     sides = [MIN_SIDE * 2**k for k in range(int(math.log2(plan.max_size / MIN_SIDE)) + 1)]
-    for surface in surfaces(plan):
-        swept = min(surface.meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
-        for mesh in surface.meshes:
+    for name, (makers, camera) in SURFACES.items():
+        meshes = list(growing(makers, plan.max_triangles))
+        swept = min(meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
+        for mesh in meshes:
             for sweep, side in [("triangles", plan.size), *(("pixels", side) for side in sides if mesh is swept)]:
-                yield partial(picture_rows, plan, surface, mesh, sweep, side)
+                yield partial(picture_rows, plan, name, mesh, camera, sweep, side)
 
 
-def picture_rows(plan: Plan, surface: Surface, mesh: Mesh, sweep: str, side: int) -> list[Row]:
+def growing(makers: Sequence[Callable[[], Mesh]], most: int) -> Iterator[Mesh]:
+    """Yield the first mesh, and the next ones of at most so many triangles."""
+    for i, make in enumerate(makers):
+        mesh = make()
+        if i and len(mesh.faces) > most:
+            return
+        yield mesh
+
+
+def picture_rows(plan: Plan, surface: str, mesh: Mesh, camera: Camera, sweep: str, side: int) -> list[Row]:
     geometry = Geometry.of(mesh)
-    raster = rasterizer(geometry, surface.camera, side, plan.device)
-    cast, build_seconds = ray_caster(geometry, surface.camera, side, plan.accel, plan.device)
+    raster, (cast, build_seconds) = rasterizer(geometry, camera, side), ray_caster(geometry, camera, side, plan.accel)
     seconds = alternate({"raster": raster, "cast": cast}, plan.runs)
-    return [Row(sweep=sweep, surface=surface.name, triangles=len(mesh.faces), pixels=side * side, build=build_seconds,
+    return [Row(sweep=sweep, surface=surface, triangles=len(mesh.faces), pixels=side * side, build=build_seconds,
                 **{name: each.tolist() for name, each in seconds.items()}, **compared(raster(), cast()))]
 
 
-def exponents(rows: Sequence[Row]) -> list[Row]:
-    """Fit seconds ~ n^exponent by least squares on logarithms, in each sweep with two or more points."""
-    out = []
-    for (sweep, surface), group in grouped(rows, "sweep", "surface").items():
-        for cost in ("raster", "cast", "build") if len(group) > 1 else ():
-            seconds = [np.median(getattr(row, cost)) for row in group]
-            slope = np.polyfit(np.log([getattr(row, sweep) for row in group]), np.log(seconds), 1)[0]
-            out.append(Row(sweep=sweep, surface=surface, cost=cost, exponent=float(slope)))
-    return out
-
-
 def machine(plan: Plan) -> str:
-    return machine_line("one thread used" if plan.device == "cpu" else "", f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
+    return machine_line("one thread used", f"structure {plan.accel}, {plan.runs} runs")
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    tables = [tabled(COLUMNS, group, f"As {sweep} grow") for (sweep,), group in grouped(rows, "sweep").items()]
-    return [*tables, tabled(EXPONENTS, exponents(rows), "Exponents")]
-
-
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
-    return {"exponents": [row.as_dict() for row in exponents(rows)]}
+    return [tabled(COLUMNS, group, f"As {sweep} grow") for (sweep,), group in grouped(rows, "sweep").items()]

@@ -21,8 +21,6 @@ class Stability(Plan):
     rays: int = option(10_000, "Number of rays of each case for the first contestant", (1, 2**40))
     sample: int = option(10_000, "Number of these rays that the oracle judges, and that the other contestants trace", (1, 2**40))
     seed: int = the_seed()
-    threads: int | None = option(None, "Number of CPU threads for the rays beyond the sample  [default: all cores]",
-                                 check="wrt.core.threads:thread_count")
     runs: int = option(7, "Timed runs of each contestant, alternating", (1, 1000))
 
 
@@ -37,5 +35,5 @@ class Closed(Plan):
     meshes: Sequence[Any] = the_meshes()
     points: int = option(10_000, "Number of points for each mesh", (1, 2**28))
     rays: int = option(10_000, "Number of rays for each mesh", (1, 2**28))
-    others: int = option(10_000, "Most points and rays for another library (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
+    others: int = option(10_000, "Most points and rays for another library; 0: none", (0, 2**28))
     seed: int = option(0, "Seed of the random points and rays")

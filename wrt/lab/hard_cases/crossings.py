@@ -1,6 +1,5 @@
 """`python -m wrt bench closed`: points inside closed meshes, and rays through corners and edges, by wrt and other libraries."""
 
-import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -80,9 +79,8 @@ def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
     """Yield wrt and each installed library with its number of queries: n for wrt, at most plan.others for another library."""
     yield "wrt", n
     for name, (package, _) in OTHERS.items():
-        most = plan.others // (100 if name == "trimesh" else 1)
-        if most and importlib.util.find_spec(package) is not None:
-            yield name, min(n, most)
+        if plan.others and importlib.util.find_spec(package) is not None:
+            yield name, min(n, plan.others)
 
 
 def points_wrong(geometry: Geometry, reference: Reference, answer: Answer, n: int, seed: int) -> dict[str, object]:
@@ -201,19 +199,18 @@ def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
             lambda origins, directions: scene.count_intersections(tensor(np.concatenate([origins, directions], axis=1))).numpy())
 
 
-def trimesh_answers(module: str, geometry: Geometry) -> tuple[Answer, Answer]:
-    """Return two functions of trimesh: points -> flags of the points inside; origins, directions -> number of hits of each ray."""
+def embree_answers(geometry: Geometry) -> tuple[Answer, Answer]:
+    """Return two functions of trimesh with Embree: points -> flags of the points inside; origins, directions -> number of hits."""
     import trimesh
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-    mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
-    rays = importlib.import_module(f"trimesh.ray.{module}").RayMeshIntersector(mesh)
+    rays = RayMeshIntersector(trimesh.Trimesh(geometry.vertices, geometry.faces, process=False))
     return rays.contains_points, lambda origins, directions: np.bincount(rays.intersects_id(origins, directions)[1], minlength=len(origins))
 
 
 # Name -> the package that a library needs, and its two functions for a geometry.
 OTHERS: dict[str, tuple[str, Callable[[Geometry], tuple[Answer, Answer]]]] = {
-    "Open3D": ("open3d", open3d_answers), "trimesh, Embree": ("embreex", partial(trimesh_answers, "ray_pyembree")),
-    "trimesh": ("rtree", partial(trimesh_answers, "ray_triangle"))}
+    "Open3D": ("open3d", open3d_answers), "trimesh, Embree": ("embreex", embree_answers)}
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:

@@ -18,20 +18,17 @@ from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 RAYS_AT_ONCE = 1 << 16
 FACES_AT_ONCE = 4096  # few enough that float64 temporaries stay in the cache
 EXAMPLES = 8  # wrong rays that a verdict stores
-BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160  # of an error histogram; the first bin ends at 2^LOWEST_OCTAVE units
 
 
 @dataclass
 class Errors:
     """Errors of one quantity. The unit is a float32 ulp at the exact t for t, and 2^-24 for u and v.
-    - largest: largest error; histogram: counts of errors, for percentiles. These two fields cover exact hits only.
-    - largest_ratio: largest error over its derived bound; over: number of errors above the bound. These two fields include borderline
-      hits, which may lie far outside the triangle in its plane."""
+    - values: errors of exact hits. largest_ratio: largest error over its derived bound; over: number of errors above the bound. These two
+      fields include borderline hits, which may lie far outside the triangle in its plane."""
 
-    largest: float = 0.0
+    values: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     largest_ratio: float = 0.0
     over: int = 0
-    histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
 
     def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray, exact_hit: np.ndarray) -> np.ndarray:
         """Add absolute errors; NaN counts as infinite. Return flags of errors above `bound`. unit: size of one unit; exact_hit: flags."""
@@ -41,28 +38,19 @@ class Errors:
         np.divide(error, bound, out=ratio, where=np.isfinite(error))
         self.largest_ratio = max(self.largest_ratio, float(ratio.max(initial=0.0)))
         self.over += int(over.sum())
-        scaled = (error / unit)[exact_hit]
-        self.largest = max(self.largest, float(scaled.max(initial=0.0)))
-        octave = np.log2(np.maximum(scaled, 2.0**LOWEST_OCTAVE)) - LOWEST_OCTAVE
-        index = np.minimum(np.ceil(octave * BINS_PER_OCTAVE), N_BINS - 1).astype(np.int64)
-        self.histogram += np.bincount(index, minlength=N_BINS)
+        self.values = np.concatenate([self.values, (error / unit)[exact_hit].astype(np.float32)])
         return over
 
-    def percentile(self, q: float) -> float:
-        """Return an upper bound on the q-th percentile, less than 10 % too large above 2^-12 units; NaN if the histogram is empty."""
-        total = int(self.histogram.sum())
-        if not total:
-            return float("nan")
-        index = int(np.searchsorted(np.cumsum(self.histogram), q / 100.0 * total))
-        return min(2.0 ** (LOWEST_OCTAVE + index / BINS_PER_OCTAVE), self.largest)
+    @property
+    def largest(self) -> float:
+        return float(self.values.max(initial=0.0))
 
     @property
     def p999(self) -> float:
-        return self.percentile(99.9)
+        return float(np.percentile(self.values, 99.9, method="inverted_cdf")) if len(self.values) else float("nan")
 
     def __add__(self, other: "Errors") -> "Errors":
-        return Errors(max(self.largest, other.largest), max(self.largest_ratio, other.largest_ratio),
-                      self.over + other.over, self.histogram + other.histogram)
+        return Errors(np.concatenate([self.values, other.values]), max(self.largest_ratio, other.largest_ratio), self.over + other.over)
 
     def as_dict(self) -> dict[str, float]:
         return {"max": self.largest, "p999": self.p999, "bound_ratio": self.largest_ratio, "over_bound": self.over}

@@ -1,8 +1,6 @@
 """`python -m wrt stability`: run the hard cases on intersection tests and ray libraries, and measure errors and speed."""
 
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -14,7 +12,6 @@ from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.snapshot import Structure
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
-from wrt.core.threads import thread_count
 from wrt.core.types import Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
@@ -48,7 +45,7 @@ COLUMNS: Columns = {
 ALL: Columns = {
     "contestant": "{name}", "rays": "{v.rays}", **WRONG, "t over bound": "{v.t.over}", "errors": "{errors}",
     "wrong per million": lambda row: f"{1e6 * wrong(row.v) / max(row.v.rays, 1):.3g}", "typical t ulp": "{typical:.3g}",
-    "Mray/s": lambda row: spread(row.mrays), "speed / first": lambda row: spread(row.ratios), "B/triangle": "{bytes_per_triangle:.0f}"}
+    "Mray/s": lambda row: spread(row.mrays), "speed / first": lambda row: spread(row.ratios)}
 LEGEND = f"""\
 judged: the first rays of a case (--sample), which the oracle judges. For further rays the right answer is known in advance: a closed
 surface must be hit, a triangle with collinear corners must not be hit, and a ray must not hit the triangle on which it starts. misses:
@@ -81,7 +78,7 @@ def speed_rows(all_of_them: Sequence[Contestant], runs: int) -> list[Row]:
     for one in all_of_them:
         one.prepare(case.geometry)
     seconds = alternate({one.name: partial(one.closest, case.origins, case.directions) for one in all_of_them}, runs)
-    return [Row(name=one.name, mrays=(SPEED_RAYS / seconds[one.name] / 1e6).tolist(), bytes_per_triangle=one.bytes_per_triangle,
+    return [Row(name=one.name, mrays=(SPEED_RAYS / seconds[one.name] / 1e6).tolist(),
                 ratios=(seconds[all_of_them[0].name] / seconds[one.name]).tolist()) for one in all_of_them]
 
 
@@ -124,40 +121,21 @@ def run_case(name: str, rays: int, one: Contestant, seed: int = 0, compared: int
 
 
 def judge_further(name: str, plan: Plan, one: Own) -> Iterator[Verdict]:
-    """Yield verdicts, without the oracle, on the rays beyond the sample, traced by `one` on all threads."""
-    own = threading.local()  # each thread has its own structure
-
-    def part(index: int) -> Verdict:
-        own.copy = getattr(own, "copy", None) or type(one)(one.NAME, **one.options)
-        return further_chunk(name, plan, index, own.copy)
-
-    pool = ThreadPoolExecutor(thread_count(plan.threads))
-    try:
-        yield from pool.map(part, range(n_chunks(name, plan)))
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def n_chunks(name: str, plan: Plan) -> int:
-    """Return the number of chunks of rays beyond the sample; 0 for a case that only the oracle can judge."""
-    left = fewer(name, plan.rays) - fewer(name, plan.sample)
-    if left <= 0:
-        return 0
-    probe = generate(name, 64, plan.seed)
-    return 0 if (probe.expected == UNKNOWN).all() and probe.next_directions is None else -(-left // CHUNK)
-
-
-def further_chunk(name: str, plan: Plan, index: int, own: Own) -> Verdict:
-    """Return the verdict, without the oracle, on one chunk of the rays beyond the sample."""
-    left = fewer(name, plan.rays) - fewer(name, plan.sample)
-    first = -(-fewer(name, plan.sample) // CHUNK)  # the sample has used the seeds below
-    case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
-    own.prepare(case.geometry)
-    verdict = check(case, own.closest(case.origins, case.directions, case.t_min, case.t_max))
-    if case.next_directions is None:
-        verdict.rays -= int((case.expected == UNKNOWN).sum())  # these rays were not judged
-        return verdict
-    return verdict + judge_next(case, *respawn(own, case))
+    """Yield verdicts, without the oracle, on chunks of the rays beyond the sample. A case that only the oracle can judge has none."""
+    sample = fewer(name, plan.sample)
+    left, probe = fewer(name, plan.rays) - sample, generate(name, 64, plan.seed)
+    if (probe.expected == UNKNOWN).all() and probe.next_directions is None:
+        return
+    for index in range(-(-max(left, 0) // CHUNK)):
+        seed = plan.seed, -(-sample // CHUNK) + index  # the sample has used the seeds below
+        case = generate(name, min(CHUNK, left - index * CHUNK), seed)
+        one.prepare(case.geometry)
+        verdict = check(case, one.accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))
+        if case.next_directions is None:
+            verdict.rays -= int((case.expected == UNKNOWN).sum())  # these rays were not judged
+        else:
+            verdict += judge_next(case, *respawn(one, case))
+        yield verdict
 
 
 def _is_refused(case: HardCase, one: Contestant) -> bool:
@@ -240,5 +218,5 @@ def line(row: Row) -> str:
 
 def machine(plan: Plan) -> str:
     missing = [name for name in PEERS if plan.peers and contestant(name).missing()]
-    return machine_line(f"{thread_count(plan.threads)} threads used", versions("warp-lang", "embreex", "open3d", "mitsuba", "trimesh"),
+    return machine_line("", versions("warp-lang", "embreex", "open3d", "mitsuba", "trimesh"),
                         *([f"not installed: {', '.join(missing)}"] if missing else []))

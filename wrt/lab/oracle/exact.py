@@ -161,52 +161,28 @@ class SphereCrossings:
 
 
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
-    """Intersect line i with sphere i. Origins o, directions d, center: (3, N); radius: (N,) > 0; all float64 that hold float32 values.
+    """Intersect line i with sphere i in integers. Origins o, directions d, center: (3, N); radius: (N,) > 0; float64 of float32 values.
 
-    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE."""
-    f = o - center
-    a, b, ff, rr = (d * d).sum(axis=0), (d * f).sum(axis=0), (f * f).sum(axis=0), radius * radius
-    cross = np.stack([d[j] * f[k] - d[k] * f[j] for j, k in ((1, 2), (2, 0), (0, 1))])
-    size = np.stack([np.abs(d[j] * f[k]) + np.abs(d[k] * f[j]) for j, k in ((1, 2), (2, 0), (0, 1))])
-    discriminant = a * rr - (cross * cross).sum(axis=0)
-    error = 20.0 * UNIT * (a * rr + (size * size).sum(axis=0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.sqrt(np.maximum(discriminant, 0.0))
-        root_error = error / root
-        q = -b + np.where(b > 0.0, -root, root)
-        q_error = root_error + 8.0 * UNIT * ((np.abs(d * f)).sum(axis=0) + root)
-        t = np.stack([q / a, (ff - rr) / q])
-        t_error = np.abs(t) * (2.0 * q_error / np.abs(q) + 8.0 * UNIT)
-        t_error[1] += 8.0 * UNIT * (ff + rr) / np.abs(q)
-        good = (q_error < 0.5 * np.abs(q)) & (t_error <= ACCURATE * np.abs(t)).all(axis=0)
-    order = np.argsort(t, axis=0)
-    t, t_error = np.take_along_axis(t, order, axis=0), np.take_along_axis(t_error, order, axis=0)
-    hit = discriminant >= 0.0
-    touching = np.zeros_like(hit)
-    decided = (discriminant < -error) | ((discriminant > error) & good)
-    for i in np.flatnonzero(~decided):
-        sign, roots = _sphere_exact(o[:, i], d[:, i], center[:, i], float(radius[i]))
-        hit[i], touching[i] = sign >= 0, sign == 0
-        t[:, i], t_error[:, i] = roots, 2.0 * UNIT * np.abs(roots)
-    t[:, ~hit] = np.nan
-    return SphereCrossings(hit, touching, t, t_error)
+    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most 2 UNIT."""
+    signs, t = np.empty(o.shape[1], np.int8), np.empty((2, o.shape[1]))
+    columns = ((2.0**149 * rows).T.tolist() for rows in (o, d, center, radius[None]))  # float32 values are multiples of 2^-149
+    for i, numbers in enumerate(zip(*columns, strict=True)):
+        signs[i], t[:, i] = _sphere_exact(*([int(x) for x in row] for row in numbers))
+    return SphereCrossings(signs >= 0, signs == 0, t, 2.0 * UNIT * np.abs(t))
 
 
-def _sphere_exact(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: float) -> tuple[int, np.ndarray]:
-    """Return the exact sign of the discriminant of one line and sphere, and both roots in float64."""
-    columns = [np.array(x, dtype=np.float64).reshape(-1, 1) for x in (o, center, [radius, 0.0, 0.0])]
-    (origin, middle, extent), k = whole_numbers(*columns)
-    (direction,), k_d = whole_numbers(d.reshape(3, 1))
-    f = [int(p[0]) - int(q[0]) for p, q in zip(origin, middle, strict=True)]
-    w, r = [int(x[0]) for x in direction], int(extent[0][0])
-    a, b, c = (sum(p * q for p, q in zip(x, y, strict=True)) for x, y in ((w, w), (w, f), (f, f)))
-    discriminant = b * b - a * (c - r * r)
+def _sphere_exact(o: list[int], d: list[int], center: list[int], radius: list[int]) -> tuple[int, tuple[float, float]]:
+    """Return the exact sign of the discriminant of one line and sphere, and both roots in float64, NaN if it is negative."""
+    f = [p - q for p, q in zip(o, center, strict=True)]
+    a, b, c = (sum(p * q for p, q in zip(x, y, strict=True)) for x, y in ((d, d), (d, f), (f, f)))
+    rest = c - radius[0] ** 2
+    discriminant = b * b - a * rest
     if discriminant < 0:
-        return -1, np.full(2, np.nan)
+        return -1, (math.nan, math.nan)
     if discriminant == 0 and b == 0:
-        return 0, np.zeros(2)
+        return 0, (0.0, 0.0)
     # q adds two numbers of equal sign, so that 128 fractional bits suffice; the other root follows from the product of the roots.
     root = math.isqrt(discriminant << 256)
     q = -(b << 128) - (root if b >= 0 else -root)
-    roots = sorted((q / (a << 128), ((c - r * r) << 128) / q))
-    return (1 if discriminant else 0), np.array([math.ldexp(t, k - k_d) for t in roots])
+    first, second = q / (a << 128), (rest << 128) / q
+    return (1 if discriminant else 0), (min(first, second), max(first, second))
