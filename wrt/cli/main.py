@@ -27,19 +27,19 @@ from wrt.core.registry import Registry
 COMMANDS: Registry[click.Command] = Registry("command", {
     "animate": "wrt.cli.render:animate",
     "bench": "wrt.cli.measure:bench",
-    "build": "wrt.cli.build:build",
+    "build": "wrt.cli.files:build",
     "compare": "wrt.cli.files:compare",
-    "compile": "wrt.cli.build:compile_kernels",
+    "compile": "wrt.cli.files:compile_kernels",
     "devices": "wrt.cli.measure:devices",
     "info": "wrt.cli.files:info",
-    "inspect": "wrt.cli.inspect:inspect",
+    "inspect": "wrt.cli.measure:inspect",
     "profile": "wrt.cli.measure:profile",
     "render": "wrt.cli.render:render",
     "schema": "wrt.cli.files:schema",
     "stability": "wrt.cli.measure:stability",
     "validate": "wrt.cli.files:validate",
     "view": "wrt.cli.view:view",
-    "walk": "wrt.cli.inspect:walk",
+    "walk": "wrt.cli.measure:walk",
     "whatif": "wrt.cli.measure:whatif",
 }, "wrt.commands", click.Command)
 

@@ -18,6 +18,7 @@ from PIL import Image
 from tests.command_line import BOX_OBJ, Result, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
+from tests.device import NAME
 from tests.picture_metadata import read_metadata
 from wrt import __version__, load_accel
 from wrt.cli import common as cli_common
@@ -273,18 +274,6 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
     assert broken.code == 1 and [line.split()[0] for line in broken.err.splitlines()] == ["mse", "psnr", "flip"]
 
 
-def test_compare_sees_where_a_crop_lies() -> None:
-    """Two crops have the same pixels, and one lies two columns further to the right in the picture."""
-    import OpenImageIO as oiio
-
-    for name, x in (("left.exr", 0), ("right.exr", 2)):
-        spec = oiio.ImageSpec(2, 2, 3, "float")
-        spec.x, spec.full_width, spec.full_height = x, 8, 4
-        out = oiio.ImageOutput.create(name)
-        assert out.open(name, spec) and out.write_image(np.ones((2, 2, 3), np.float32)) and out.close()
-    assert strict_json(run("compare", "left.exr", "right.exr", "--json").out)["mse"] == pytest.approx(8 / 32)
-
-
 @pytest.mark.parametrize(("arguments", "message"), [
     (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: is no image file"),
     (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png"),
@@ -296,6 +285,16 @@ def test_compare_refuses(arguments: list[str], message: str) -> None:
     write_image("small.exr", np.ones((4, 8, 3)))
     refused(run("compare", *arguments), message)
     assert not Path("d.exr").exists() and not Path("d.png").exists()
+
+
+def test_compile_reports_the_kernels() -> None:
+    scene = str(ROOT / "scenes" / "fisheye.toml")
+    result = run("compile", scene, "--json")
+    done = json.loads(result.out)["compiled"]
+    assert result.code == 0 and [entry["for"] for entry in done] == ["queries of bvh", scene]
+    assert ("shade_wave" if NAME == "cpu" else "render") in done[1]["kernels"] and all(entry["seconds"] >= 0.0 for entry in done)
+    result = run("compile", "--accel", "bvh")
+    assert result.code == 0 and result.out.startswith("queries of bvh: 2 kernels, ")
 
 
 def test_devices_lists_the_cpu_first() -> None:
@@ -336,12 +335,6 @@ def finish(running: subprocess.Popen[str]) -> Result:
     finally:
         running.kill()  # if it has not ended
     return Result(running.returncode, out, without_compiling(err))
-
-
-def test_a_process_renders() -> None:
-    result = finish(process("render", "box.obj", *SMALL))
-    assert (result.code, result.out) == (0, "box.png\n") and read_image("box.png").shape == (18, 32, 3)
-    assert [line.split()[0] for line in result.err.splitlines()] == ["warning:", "2", "seconds:"]  # and no message of Warp
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
@@ -396,15 +389,6 @@ def test_a_process_that_is_interrupted_writes_what_it_has(number: int, times: in
     samples = read_channels("a.exr")["samples"]
     assert samples.shape == (180, 320) and samples.max() - samples.min() <= 64 and 0 < samples.max() < 1 << 24
     assert np.isfinite(read_image("a.exr")).all() and new_files() == {"a.exr"}
-
-
-def test_an_ignored_signal_stays_ignored() -> None:
-    code = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n{AT_ONCE}"
-    running = process("render", "box.obj", "--size", "64x36", "--spp", 4096, "--time-limit", "2s", "-o", "a.png", code=code)
-    assert running.stderr is not None
-    assert any("Mray/s" in line for line in running.stderr)
-    running.send_signal(signal.SIGHUP)
-    assert finish(running).code == 0
 
 
 LOADING = """

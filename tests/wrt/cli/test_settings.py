@@ -202,14 +202,6 @@ def test_pixels_that_are_visibly_darker_are_counted(albedo: float, settings: dic
     assert film.stats["visibly_cut"] == expected
 
 
-def test_more_bounces_do_not_help_where_a_ray_goes_through_too_many_surfaces() -> None:
-    pane = Material(albedo=(0, 0, 0), alpha=0.001, alpha_mode="blend")
-    panes = tuple(Object(quad((-100, -100, -0.01 * i), (200, 0, 0), (0, 200, 0)), (pane,)) for i in range(300))
-    film = wrt.render(Scene(panes, background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 5), (0, 0, 0)),)),
-                      size=(4, 3), spp=1)
-    assert film.stats["cut_by_depth"] > 0 and film.stats["visibly_cut"] == 0.0
-
-
 @pytest.mark.parametrize("pane", [Material("glass", thin=True, albedo=(1, 1, 1)),
                                   Material("metallic_roughness", transmission=1.0, thin=True, albedo=(1, 1, 1))])
 def test_glass_without_a_given_depth_is_followed_through_all_its_surfaces(pane: Material) -> None:

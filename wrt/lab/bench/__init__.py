@@ -79,7 +79,6 @@ class Error(OnScene):
     max_spp: int = option(64, "Largest number of samples per pixel, after 1, 2, 4, ...", (1, 1 << 16))
     repeats: int = option(8, "Seeds for each picture; their spread gives the confidence intervals", (3, 1000))  # 2 seeds have no spread
     reference_spp: int | None = option(None, "Samples per pixel of 8 reference pictures each  [default: 8 times --max-spp]", (1, 1 << 24))
-    row_limit: float = option(120.0, "Leave out a picture whose seeds together would take longer than this time  [default: 120s]")
     seed: int = the_seed()
     device: str = the_device()
     threads: int | None = the_threads()

@@ -152,10 +152,7 @@ class Embree(Contestant):
         with needed_by(self.name):
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
-        try:
-            self.scene = EmbreeScene(robust=self.options["mode"] == "robust")
-        except TypeError as error:
-            raise InputError("embreex is too old: it has no choice of the mode", hint='pip install "embreex>=4.4"') from error
+        self.scene = EmbreeScene(robust=self.options["mode"] == "robust")
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
         self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # Embree builds at the first query
 

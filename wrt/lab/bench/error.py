@@ -38,7 +38,6 @@ BASE = "as it is"
 # the Convergence Rate of Randomized Quasi-Monte Carlo for Discontinuous Functions"). Here d is 2: each pair of dimensions is a net by
 # itself. An integrand that depends on two pairs at once (pixel and lens, pixel and light) has -1, as for independent samples.
 THEORY = {"independent": "-1", "sobol": "-1 to -3"}
-NO_EFFECT = "it changes nothing in this scene"
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5  # least max_depth and largest min_throughput of the reference
 BRUTE_FORCE_LIMIT = 5000  # most primitives for which brute force is measured
@@ -110,12 +109,12 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
 
 
 def groups(plan: Plan) -> Groups:
-    """Yield a group with the reference and the knobs without effect, then a group for each variant. All seeds follow from plan.seed."""
+    """Yield a group with the reference, then a group for each variant. All seeds follow from plan.seed."""
     scene, options = plan.load(), Options(device=plan.device, threads=plan.threads, camera=plan.camera)
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     found, without_effect = variants(scene, options, features_of(scene, scene.camera(plan.camera)), plan.knobs or tuple(KNOBS))
     truth = cache(partial(make_reference, scene, options, plan.reference_spp or 8 * plan.max_spp, seeds[:REFERENCE_SEEDS]))
-    yield lambda: [truth(), *(Row(variant=name, left_out=NO_EFFECT) for name in without_effect)]
+    yield lambda: [Row(**vars(truth()), without_effect=without_effect)]
     for variant in found:
         yield partial(variant_rows, plan, variant, seeds[REFERENCE_SEEDS:], truth)
 
@@ -146,16 +145,10 @@ def finished(film: Film) -> Film:
 
 
 def variant_rows(plan: Plan, variant: Variant, seeds: Sequence[int], truth: Callable[[], Row]) -> list[Row]:
-    """Return a row for 1, 2, 4 ... samples per pixel, up to plan.max_spp, or until a row would take longer than plan.row_limit."""
-    rows: list[Row] = []
+    """Return a row for 1, 2, 4 ... samples per pixel, up to plan.max_spp."""
     renderer = Renderer(variant.scene, variant.options)
     finished(renderer.run(spp=1))  # the first launch is slower, and not timed
-    for spp in plan.levels:
-        likely = 2.0 * rows[-1].seconds.value * plan.repeats if rows else 0.0
-        if likely > plan.row_limit:
-            return [*rows, Row(variant=variant.label, left_out=f"from {spp} spp on its seeds would take about {likely:.0f} s")]
-        rows.append(measure(variant, renderer, spp, seeds, truth()))
-    return rows
+    return [measure(variant, renderer, spp, seeds, truth()) for spp in plan.levels]
 
 
 def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Row) -> Row:
@@ -238,21 +231,21 @@ and light) has -1."""
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    truth, left_out = rows[0], [row for row in rows if "left_out" in vars(row)]
-    same = same_pixels(rows)
+    truth, same = rows[0], same_pixels(rows)
     text = (f"Reference: the mean (float64) of {truth.seeds} pictures with {truth.spp_each} spp each, exact Fresnel, max_depth"
             f" {truth.max_depth}, min_throughput {truth.min_throughput:g}, rendered in {truth.seconds:.0f} s. Its standard error is"
             f" {number(truth.rmse)} (root mean square over the pixels, whose mean is {number(truth.mean)}). Cut rays had"
             f" {number(truth.lost_throughput_per_sample)} of the throughput.")
     if same:
         text += f"\n\nPixels equal to those of the unchanged scene, bit for bit: {', '.join(same)}."
-    return [tabled(COLUMNS, pictures_of(rows), "", text), tabled(SLOPES, slopes(rows), "Slopes of the error"),
-            *([tabled({"setting": "{variant}", "reason": "{left_out}"}, left_out, "Left out")] if left_out else [])]
+    if truth.without_effect:
+        text += f"\n\nLeft out, because they change nothing in this scene: {', '.join(truth.without_effect)}."
+    return [tabled(COLUMNS, pictures_of(rows), "", text), tabled(SLOPES, slopes(rows), "Slopes of the error")]
 
 
 def line(row: Row) -> str:
     if "spp" not in vars(row):
-        return f"{row.variant}: {row.left_out}" if "left_out" in vars(row) else f"reference: {row.seconds:.0f} s"
+        return f"reference: {row.seconds:.0f} s"
     return f"{row.variant}, {row.spp} spp: {row.seconds.value:.3g} s, RMSE {interval(row.rmse)}"
 
 

@@ -28,7 +28,7 @@ class Result:
     - lost: rays that must hit but are reported to miss; wrong_triangle: rays for which another triangle is nearer.
     - invented: reported hits of a triangle that the ray misses by more than float32 rounding, or reported points that are not on the ray.
     - t_ulp: largest error of t, in float32 steps at the exact t. examples: the first wrong rays, each with the reason.
-    - raised: the error that the function raised; refused: the input was not finite, so raising was right."""
+    - raised: the error that the function raised, or None; refused: the input was not finite, so raising was right."""
 
     case: str
     rays: int
@@ -36,7 +36,7 @@ class Result:
     invented: int = 0
     wrong_triangle: int = 0
     t_ulp: float = 0.0
-    raised: str = ""
+    raised: Exception | None = None
     refused: bool = False
     examples: tuple[dict[str, Any], ...] = ()
 
@@ -48,12 +48,13 @@ class Result:
     @property
     def ok(self) -> bool:
         """True if no ray is wrong, and no error was raised for finite input."""
-        return not (self.wrong or (self.raised and not self.refused))
+        return not self.wrong and (self.raised is None or self.refused)
 
     @property
     def note(self) -> str:
         """The error that the function raised, "refused" if raising was right, or "" without an error."""
-        return "refused" if self.refused else self.raised
+        text = "" if self.raised is None else f"{type(self.raised).__name__}: {self.raised}".splitlines()[0][:100]
+        return "refused" if self.refused else text
 
     def __str__(self) -> str:
         counted = f"{self.lost} lost, {self.invented} invented, {self.wrong_triangle} with a wrong triangle"
@@ -111,31 +112,27 @@ class Case:
 
     def result(self, closest_hit: ClosestHit) -> Result:
         """Test `closest_hit` (see `hard_cases`) on this case. An error that it raises becomes part of the result."""
-        return self._judged(closest_hit, keep_errors=True)
-
-    def check(self, closest_hit: ClosestHit) -> None:
-        """Raise AssertionError with the wrong rays: lost, invented or with a wrong triangle.
-        An error of `closest_hit` passes through, unless the input is not finite: then an error is a right answer."""
-        result = self._judged(closest_hit, keep_errors=False)
-        if not result.ok:
-            raise AssertionError(f"{result}\n({self.about})")
-
-    def _judged(self, closest_hit: ClosestHit, keep_errors: bool) -> Result:
         verdict = Verdict()
         for part in self.parts:
             geometry = part.geometry
             try:
                 answer = closest_hit(geometry.vertices.copy(), geometry.faces.copy(), part.origins.copy(), part.directions.copy())
             except Exception as error:
-                if not (part.refused or keep_errors):
-                    raise
-                raised = f"{type(error).__name__}: {error}".splitlines()[0][:100]
-                return Result(self.name, self.rays, raised=raised, refused=part.refused)
+                return Result(self.name, self.rays, raised=error, refused=part.refused)
             t, prim_id = _checked(answer, len(part))
             prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # apply t_max, which closest_hit does not have
             verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)  # type: ignore[arg-type]  # judge t without u and v
         return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
                       examples=tuple(verdict.examples))
+
+    def check(self, closest_hit: ClosestHit) -> None:
+        """Raise AssertionError with the wrong rays: lost, invented or with a wrong triangle.
+        An error of `closest_hit` passes through, unless the input is not finite: then an error is a right answer."""
+        result = self.result(closest_hit)
+        if result.raised is not None and not result.refused:
+            raise result.raised
+        if not result.ok:
+            raise AssertionError(f"{result}\n({self.about})")
 
     def __repr__(self) -> str:
         return self.name

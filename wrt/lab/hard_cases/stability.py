@@ -154,13 +154,14 @@ def _respawn_kernel(structure: Structure) -> Kernel:
     return make_respawn_kernel(structure.struct, structure.traversal(any_hit=False), surface_at)
 
 
-def respawn(one: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
-    """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each."""
+def respawn(one: Own, case: HardCase, exclude: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each.
+    exclude: the second ray excludes the triangle on which it starts, as in a render."""
     accel, n = one.accel, len(case)
     assert case.next_directions is not None
     out = Respawn()
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
-    out.exclude = 1
+    out.exclude = int(exclude)
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
     surfaces, geometry = Surfaces(), case.geometry
     surfaces.n_triangles = len(geometry.faces)

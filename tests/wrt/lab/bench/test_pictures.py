@@ -9,7 +9,6 @@ import pytest
 
 from tests.command_line import wrt as command
 from tests.data import ROOT
-from tests.refused import refused
 from wrt.lab.bench.pictures import Plan
 from wrt.lab.bench.report import run, text
 
@@ -31,12 +30,3 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = command("bench", "pictures", SCENE, "--size", "32x18", "--spp", 1, "--runs", 1, "-o", "a.md", "--json")
     assert result.code == 0 and json.loads(result.out)["rows"][0]["differ"] == 0 and "loop / waves" in Path("a.md").read_text()
-
-
-def test_what_is_refused() -> None:
-    with refused("runs"):
-        Plan((SCENE,), runs=0)
-    with refused("size"):
-        run(Plan((SCENE,), size="a lot"))
-    with refused(what="toml", path="gone.toml"):
-        run(Plan(("gone.toml",)))

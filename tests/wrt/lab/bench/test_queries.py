@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import warp as wp
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
+from tests.data import data_path
 from tests.refused import Refusal, refused
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
@@ -179,14 +182,6 @@ def test_the_command_prints_and_writes(box, tmp_path) -> None:
     assert all(float(row["ns"]) > 0.0 for row in csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (("nonsense",), "no contestant 'nonsense'"), (("--rays", "x"), "no kind of query 'x'"), (("--number", "0"), "number must be 1"),
-    (("bvh8", "--meshes", "nothing.obj"), "nothing.obj"), (("-o", "a.txt"), "must be a .md, .json or .csv file")])
-def test_mistakes_are_told_in_a_line(arguments, message) -> None:
-    out = command("bench", "queries", *arguments)
-    assert out.code == 2 and len(out.errors) == 1 and message in out.errors[0]
-
-
 def test_a_mesh_without_triangles_is_refused() -> None:
     with refused(what="no triangles"):
         run(Plan(("bvh8",), (Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)),)))
@@ -206,3 +201,13 @@ def test_inward_rays_meet_the_box_as_often_as_its_surface_says() -> None:
     share = build(geometry, "bvh").any_hit(rays.origins, rays.directions).mean()
     assert len(rays) == 40_000 and share == pytest.approx(area / (2.0 * (e[0] * e[1] + e[1] * e[2] + e[2] * e[0])), abs=4.0 * 0.5 / 200.0)
     np.testing.assert_allclose(np.linalg.norm(rays.origins, axis=1), np.linalg.norm(e) / 2.0, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_default_tree_of_the_dragon_takes_less_than_600_bytes_a_triangle() -> None:
+    code = ("import resource, sys, wrt\nfrom wrt.scene.shapes import icosphere\nwrt.build(icosphere(0))\n"
+            "mesh = wrt.load_mesh(sys.argv[1])\npeak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+            "before = peak()\nwrt.build(mesh)\nprint((peak() - before) / len(mesh.faces))")
+    command_line = [sys.executable, "-c", code, data_path("meshes/large/dragon_871k.ply")]
+    done = subprocess.run(command_line, capture_output=True, text=True, check=True)
+    assert 0.0 < float(done.stdout) < 600.0

@@ -1,4 +1,4 @@
-"""The kinds of ray: what each promises, on closed forms."""
+"""The kinds of ray: what each promises, on closed forms; and a mesh in a stadium, which a uniform grid has in one cell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wrt.accel.scenes.build import build
+from wrt.lab.bench.meshes import in_stadium
 from wrt.lab.bench.rays import RAY_KINDS, ray_sets
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -67,3 +68,19 @@ def test_a_mesh_that_is_not_seen_has_rays_all_the_same() -> None:
     for rays in ray_sets(build(thin, "bvh2"), 16).values():
         assert len(rays) == 16 and np.isfinite(rays.origins).all() and np.isfinite(rays.directions).all()
         assert (np.abs(rays.directions).max(axis=1) > 0.0).all()
+
+
+def test_a_uniform_grid_is_not_enough_and_an_adaptive_one_is() -> None:
+    ball = icosphere(4)
+    scene = in_stadium(ball)
+    assert np.array_equal(scene.faces[: len(ball.faces)], ball.faces) and np.ptp(scene.vertices[:, 0]) > 500.0 * 2.0
+    rays = ray_sets(build(ball, "bvh2"), 400)["primary"]
+    tests = {}
+    for name in ("grid", "octree", "bvh2"):
+        for mesh, where in ((ball, "alone"), (scene, "stadium")):
+            hits = build(mesh, name).closest_hit(rays.origins, rays.directions, counters=True)
+            assert (hits.prim_id[hits.prim_id >= 0] < len(ball.faces)).mean() > 0.3
+            tests[name, where] = hits.counters.primitives.mean()
+    assert tests["grid", "stadium"] > 0.4 * len(ball.faces) > 30.0 * tests["grid", "alone"]
+    for name in ("octree", "bvh2"):
+        assert tests[name, "stadium"] < 5.0 * tests[name, "alone"] + 5.0

@@ -17,10 +17,6 @@ def own(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions
     return wrt.build((vertices, faces)).closest_hit(origins, directions)
 
 
-def nothing(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
-    return np.full(len(origins), np.inf), np.full(len(origins), -1)
-
-
 CASES = ("B_jittered_vertices", "D_published", "G_coincident_uniform", "I_rays_not_finite")
 
 
@@ -31,10 +27,6 @@ def test_wrt_loses_nothing() -> None:
     assert report.results[-1].refused and report.results[-1].note == "refused"
     assert (report.total.rays, report.total.wrong) == (400, 0) and 0.0 < report.total.t_ulp < 100.0
     assert [cell.strip() for cell in str(report).splitlines()[-1].split("|")[1:6]] == ["all", "400", "0", "0", "0"]
-
-
-def test_one_name_needs_no_list() -> None:
-    assert [result.case for result in hard_cases(own, "D_published", rays=5).results] == ["D_published"]
 
 
 def test_each_fault_is_counted() -> None:
@@ -92,22 +84,6 @@ def test_what_is_raised_is_told_and_input_that_is_not_finite_may_be_refused() ->
     Case("I_mesh_not_finite", 5).check(broken)
 
 
-def test_it_may_not_change_the_case() -> None:
-    def grasping(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
-        answer = own(vertices, faces, origins, directions)
-        for array in (vertices, faces, origins, directions):
-            array[...] = 0
-        return answer
-
-    case = Case("B_jittered_uniform", 50)
-    assert case.result(grasping).ok and case.result(own).ok
-
-
-def test_no_rays_are_lost_unseen() -> None:
-    result = Case("F_edge_on", 200).result(nothing)  # mostly, the oracle knows
-    assert result.lost > 30 and result.invented == 0
-
-
 def test_all_cases_of_triangles_are_asked() -> None:
     assert set(case_names()) == HARD_CASES.keys() - set(EXCLUDED_CASES) and len(case_names()) >= 44
     for name in EXCLUDED_CASES:
@@ -119,16 +95,11 @@ def test_all_cases_of_triangles_are_asked() -> None:
 
 
 @pytest.mark.parametrize("call, said", [
-    (lambda: Case("E"), ("E", "group")), (lambda: Case("Q"), ("cases", "no hard case 'Q'")),
-    (lambda: Case("C_spheres"), ("C_spheres", "not")),
-    (lambda: Case("E_grid", 0), ("rays", "1")),
+    (lambda: Case("E"), ("E", "group")), (lambda: Case("Q"), ("cases", "no hard case 'Q'")), (lambda: Case("E_grid", 0), ("rays", "1")),
+    (lambda: hard_cases(own, ["E_grid", "C_spheres"]), ("C_spheres", "not")), (lambda: hard_cases(own, "E_grid", seed=-1), ("seed", "0")),
     (lambda: hard_cases(lambda *_: None, ["E_grid"], 5), ("closest_hit", "return t")),
     (lambda: hard_cases(lambda *_: (np.zeros(4), np.zeros(5, int)), ["E_grid"], 5), ("closest_hit", "t (5,)")),
     (lambda: hard_cases(lambda *_: (np.zeros(5), np.zeros(5)), ["E_grid"], 5), ("closest_hit", "float64")),
-    (lambda: hard_cases(lambda *_: (np.full(5, "far"), np.zeros(5, int)), "E_grid", 5), ("closest_hit", "<U3")),
-    (lambda: hard_cases(own, ["E_grid", "C_spheres"]), ("C_spheres", "not")),
-    (lambda: hard_cases(own, 3), ("each", "str", "cases")),  # type: ignore[arg-type]
-    (lambda: hard_cases(own, "E_grid", seed=-1), ("seed", "0")),
 ])
 def test_what_is_refused(call: Any, said: Refusal) -> None:
     with refused(*said):

@@ -10,8 +10,6 @@ import pytest
 import wrt
 from tests.command_line import wrt as run
 from wrt.accel.geometry import Geometry
-from wrt.accel.points.contains import open_edges
-from wrt.lab.bench.report import Row
 from wrt.lab.hard_cases import crossings as closed
 from wrt.lab.oracle.oracle import Reference
 from wrt.scene import shapes
@@ -71,10 +69,6 @@ def test_no_crossing_is_lost_and_a_lost_one_is_seen() -> None:
     assert 2500 < lossy["wrong"] <= 3000 - lossy["touching"]  # some rays pass the mesh
 
 
-def test_what_is_made_is_closed() -> None:
-    assert [open_edges(Geometry.of(mesh)) for mesh in closed.made()] == [0] * 7
-
-
 def test_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed, "made", lambda: [shapes.box(), shapes.icosphere(1)])
     result = run("bench", "closed", "--points", "200", "--rays", "200", "--others", "0")
@@ -98,16 +92,3 @@ def test_others_are_asked(who: str) -> None:
     inside, crossings = answers(geometry)
     assert np.asarray(inside(points)).tolist() == [True, False]
     assert np.asarray(crossings(points * 10.0, -points)).tolist() == [2, 2]
-
-
-def test_who_is_asked_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda package: package)
-    plan = closed.Plan(others=99)
-    assert dict(closed.asked(plan, 1000)) == {"wrt": 1000, "Open3D": 99, "trimesh, Embree": 99}
-    assert dict(closed.asked(closed.Plan(others=500), 1000))["trimesh"] == 5
-
-
-def test_the_time_of_all_is_by_crossing() -> None:
-    known = {"what": "crossings", "mesh": "", "triangles": 1, "who": "wrt", "asked": 100, "wrong": 0, "touching": 0}
-    rows = [Row(**known, hits=100, microseconds=1.0), Row(**known, hits=300, microseconds=3.0)]
-    assert "2.50" in str(closed.parts(rows, closed.Plan())[0])

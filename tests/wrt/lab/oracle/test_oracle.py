@@ -251,11 +251,6 @@ def test_an_empty_geometry_and_no_rays() -> None:
     assert len(all_hits(geometry_of(np.eye(3)[None]), np.zeros((0, 3)), np.zeros((0, 3)))) == 0
 
 
-def test_the_same_object_is_built_once() -> None:
-    geometry = geometry_of(np.eye(3)[None])
-    assert reference_of(geometry) is reference_of(geometry)
-
-
 # --- spheres --------------------------------------------------------------------------------------------------------
 
 
