@@ -28,7 +28,7 @@ class Queries(Plan):
     number: int = option(100_000, "Number of rays of each kind, and 50 times the number of points", (1, 2**28))
     runs: int = option(7, "Timed runs of each contestant, alternating", (1, 1000))
     builds: int = option(1, "Timed builds of each contestant", (1, 100))
-    threads: str = option("one", "CPU threads: one (measures CPU time), all (measures wall-clock time) or both",
+    threads: str = option("one", "CPU threads: one (measures CPU time), all (measures wall-clock time) or both; wrt and Open3D use several",
                           of=("number of threads", f"{__name__}:THREAD_CHOICES"))
     device: str = the_device()
     seed: int = the_seed()

@@ -14,7 +14,7 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import start
-from wrt.core.threads import run_all, thread_count
+from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import QUERY_KINDS
 from wrt.lab.bench import Queries as Plan
@@ -28,7 +28,6 @@ from wrt.scene.shapes import icosphere
 
 CELLS = 96  # a side of the default terrain
 SAME_T = 1e-4  # largest relative difference of t at which two triangles are a tie
-PARTS = 4  # parts of the rays for each thread, if a library uses one thread a call
 TESTS = 200_000_000  # most ray-triangle tests of the comparison with brute force
 COUNTED_RAYS = 20_000  # most rays whose traversal steps are counted
 COUNTED = {"nodes": "nodes", "leaves": "leaves", "boxes": "boxes", "primitives": "tests", "node_bytes": "node_bytes",
@@ -139,8 +138,8 @@ def kind_rows(plan: Plan, subject: dict[str, Any], ready: Callable[[], Prepared]
     """Return a row for each contestant that answers this kind of query."""
     scene = ready()
     rays, query = scene.rays[kind], {"shadow": "any", "points": "points", "tiles": "tiles"}.get(kind, "closest")
-    chosen = [one for one in scene.contestants if query in one.queries and (one.has_threads or threads == 1 or query in RAYS)]
-    searches = [searching(one, rays, threads) for one in chosen]
+    chosen = [one for one in scene.contestants if query in one.queries and (one.has_threads or threads == 1)]
+    searches = [one.search(rays, threads) for one in chosen]
     answers = [answer(one, rays, search()) for one, search in zip(chosen, searches, strict=True)]
     clock = thread_time if threads == 1 and plan.device == "cpu" else perf_counter
     seconds = alternate_on(start(plan.device), dict(enumerate(searches)), plan.runs, clock)
@@ -158,27 +157,10 @@ def kind_rows(plan: Plan, subject: dict[str, Any], ready: Callable[[], Prepared]
     return out
 
 
-def searching(one: Contestant, rays: RaySet, threads: int) -> Callable[[], list[object]]:
-    """Return a function that traces parts of the rays on `threads` threads, and returns the result of each part."""
-    count = len(rays) if one.has_threads or threads == 1 else max(-(-len(rays) // (PARTS * threads)), 1)
-    searches = [one.search(rays.part(slice(first, first + count)), threads if one.has_threads else 1)
-                for first in range(0, len(rays), count)]
-    out: list[object] = [None] * len(searches)
-
-    def search(i: int) -> None:
-        out[i] = searches[i]()
-
-    def all_parts() -> list[object]:
-        run_all([partial(search, i) for i in range(len(searches))], threads)
-        return out
-
-    return all_parts
-
-
-def answer(one: Contestant, rays: RaySet, out: list[object]) -> Hits | np.ndarray:
-    """Return closest hits by a new query, flags of the occluded rays, or distances. out: result of the function from `searching`."""
+def answer(one: Contestant, rays: RaySet, out: object) -> Hits | np.ndarray:
+    """Return closest hits by a new query, flags of the occluded rays, or distances. out: result of the function from one.search()."""
     if rays.any_hit or rays.kind in ("points", "tiles"):
-        return np.concatenate([one.result(part) for part in out])
+        return one.result(out)
     return one.closest(rays.origins, rays.directions, 0.0, rays.t_max)
 
 
@@ -205,7 +187,7 @@ def wrong_answers(one: Contestant, rays: RaySet, geometry: Geometry) -> dict[str
     few = rays.part(slice(None, None, max(len(rays) * len(geometry) // TESTS, 1)))
     brute_force = Own("brute_force", one.device, **(one.units if isinstance(one, Own) else {}))
     brute_force.prepare(geometry)
-    found, truth = (answer(each, few, searching(each, few, 1)()) for each in (one, brute_force))
+    found, truth = (answer(each, few, each.search(few, 1)()) for each in (one, brute_force))
     return {"checked": len(few), "wrong": differing(found, truth, bits=isinstance(one, Own))}
 
 
