@@ -51,9 +51,6 @@ class HitPoints64:
     point: wp.array(dtype=wp.vec3d)
 
 
-FAR = wp.constant(wp.float32(-1.0))  # a value of SplitRays.t_max
-
-
 @wp.struct
 class SplitRays:
     """Rays in rows of origin and direction, and the same in two arrays, by ray. Rays that hit nothing as in PlacedRays."""
@@ -61,7 +58,7 @@ class SplitRays:
     rays: wp.array(dtype=wp.spatial_vector)
     origins: wp.array(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
-    t_max: wp.array(dtype=wp.float32)  # inf, -inf for rays that hit nothing, or FAR for origins beyond FARTHEST
+    t_max: wp.array(dtype=wp.float32)
 
 
 @wp.func
@@ -120,13 +117,10 @@ def split_rays(rays: SplitRays, first: int):
     rays.origins[i] = wp.vec3(0.0)
     rays.directions[i] = wp.vec3(1.0)
     rays.t_max[i] = -wp.inf
-    if wp.isfinite(origin) and wp.isfinite(direction):
-        if largest(origin) > FARTHEST:
-            rays.t_max[i] = FAR
-        elif largest(direction) > 0.0:
-            rays.origins[i] = origin
-            rays.directions[i] = direction
-            rays.t_max[i] = wp.inf
+    if wp.isfinite(origin) and wp.isfinite(direction) and largest(origin) <= FARTHEST and largest(direction) > 0.0:
+        rays.origins[i] = origin
+        rays.directions[i] = direction
+        rays.t_max[i] = wp.inf
 
 
 @kernel

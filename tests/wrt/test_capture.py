@@ -129,6 +129,8 @@ AT_ONCE_ON_GPU = {"camera_rays"}  # arrays of the host in and out
 ON_GPU = {"visible", "OneMesh.closest_hit", "OneMesh.snapshot", "Instances.snapshot", "Instances.any_hit", "Instances.closest_hit",
           "refit of Warp arrays", "Hits.point", "Hits.points", "Hits.point_error", "Hits.normal", "Hits.normals", "Hits.shading_normal",
           "Hits.uv", "Hits.face", "Hits.object", "Hits.instance", "Hits.material"}
+
+
 @pytest.fixture(scope="module")
 def things(tmp_path_factory: pytest.TempPathFactory) -> Things:
     return Things(tmp_path_factory.mktemp("capture"))

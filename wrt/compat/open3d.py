@@ -19,21 +19,19 @@ from wrt.accel.queries.arguments import of_each
 from wrt.accel.queries.batches import MadeRays, trace_made
 from wrt.accel.queries.lists import begins
 from wrt.accel.queries.raw_launches import RowKernel
-from wrt.accel.queries.rays import vectors
 from wrt.compat.common import JoinedMeshes, every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
-from wrt.kernels.placed_rays import FAR, split_rays
+from wrt.kernels.placed_rays import split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number, type_of
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
 SPLIT_RAYS = RowKernel(split_rays, 1)
-FAR_AWAY = np.float32(FAR)  # a constant of Warp would make NumPy compare objects one by one
 
 
 class Array(np.ndarray):
@@ -55,9 +53,9 @@ MeshOrArray: TypeAlias = Any  # (V, 3) positions, or a mesh of any library
 class RaycastingScene:
     """A scene like open3d.t.geometry.RaycastingScene. docs/compat.md lists the differences.
 
-    Results are Open3D tensors if the program has imported open3d, and NumPy arrays otherwise. A ray or a point that is not finite
-    hits nothing, and neither does a ray with direction 0. All methods raise InputError, a ValueError, for invalid arguments, and
-    for points and origins with a finite coordinate beyond 1e37.
+    Results are Open3D tensors if the program has imported open3d, and NumPy arrays otherwise. A ray or a point that is not finite, or
+    has a coordinate beyond 1e37, hits nothing, and neither does a ray with direction 0. All methods raise InputError, a ValueError, for
+    invalid arguments.
 
     Parameters
     ----------
@@ -275,29 +273,18 @@ def _rows(value: Any, name: str, width: int, origin: np.ndarray | None) -> tuple
 
 
 def _valid_points(value: Any, origin: np.ndarray | None) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
-    """Return the leading shape, the mask of finite points (None: all), and the finite points minus `origin`."""
+    """Return the leading shape, the mask of valid points (None: all), and the valid points minus `origin`."""
     shape, points = _rows(value, "query_points", 3, origin)
-    if (np.abs(points) <= FARTHEST).all():  # the usual case
+    valid = np.abs(points) <= FARTHEST
+    if valid.all():  # the usual case
         return shape, None, points
-    valid = _finite(points, "query_points")
-    return (shape, None, points) if valid.all() else (shape, valid, points[valid])
-
-
-def _finite(array: np.ndarray, name: str) -> np.ndarray:
-    """Return the mask of finite rows. Raises InputError for finite points beyond the range of wrt's queries."""
-    finite = np.isfinite(array)
-    valid = np.ones(len(array), bool) if finite.all() else finite.all(axis=1)
-    vectors(array[:, :3] if valid.all() else np.where(valid[:, None], array[:, :3], 0.0), name, FARTHEST)
-    return valid
+    rows = valid.all(axis=1)
+    return shape, rows, points[rows]
 
 
 def _split(rows: np.ndarray) -> MadeRays:
-    """Return the rays of rows of six. Rays that hit nothing have t_max = -inf. They raise InputError for origins beyond FARTHEST."""
-    def check(t_max: np.ndarray) -> None:
-        if np.count_nonzero(t_max == FAR_AWAY):
-            _finite(rows, "rays")
-
-    return MadeRays(SPLIT_RAYS, (rows,), (), check)
+    """Return the rays of rows of six. Rays that hit nothing have t_max = -inf."""
+    return MadeRays(SPLIT_RAYS, (rows,))
 
 
 def _answers(found: dict[str, np.ndarray], shape: tuple[int, ...] | None = None) -> dict[str, Answer]:

@@ -1,6 +1,6 @@
 """Kernel launches of a query, on CPU threads or a GPU. Some structures have a CPU kernel that traces many rays at a time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -52,19 +52,15 @@ class Query(NamedTuple):
 class MadeRays(NamedTuple):
     """N rays that a kernel makes from rows of the caller, as in adapters for other libraries.
 
-    kernel: computes origins and directions (N, 3) and t_max (N,) from `given` and `inputs`; t_min is 0. check: gets t_max before the
-    rays are traced, and may raise InputError.
+    kernel: computes origins and directions (N, 3) and t_max (N,) of valid rays from `given` and `inputs`; t_min is 0.
     """
 
     kernel: RowKernel
     given: Sequence[np.ndarray]
     inputs: Sequence[object] = ()
-    check: Callable[[np.ndarray], None] | None = None
 
     def rays(self, threads: int) -> Rays:
         origins, directions, t_max = self.kernel.rows(len(self.given[0]), self.given, *self.inputs, threads=threads)
-        if self.check:
-            self.check(t_max)
         return Rays(origins, directions, constant(0.0, len(t_max)), t_max)
 
 
@@ -234,17 +230,14 @@ class Worker:
         return refused
 
     def trace_made(self, snapshot: Snapshot, made: MadeRays, n: int) -> list[np.ndarray]:
-        """Trace n rays, at most SMALL, and return the results. Raises InputError for invalid rays, as trace_query."""
+        """Trace n rays, at most SMALL, and return the results."""
         origins, directions, t_min, t_max, *_ = self.rays
         maker = self.makers.get(made.kernel)
         if maker is None:
             maker = self.makers[made.kernel] = FewRows(made.kernel, (origins, directions, t_max))
         maker.compute(n, made.given, made.inputs)
-        if made.check:
-            made.check(t_max[:n])
         t_min[:n] = 0.0
-        if self.launch(snapshot, self.packed, 0, n):
-            made.rays(1).checked()
+        self.launch(snapshot, self.packed, 0, n)
         return [found[:n].copy() for found in self.results]
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> bool:
