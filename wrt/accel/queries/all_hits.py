@@ -18,7 +18,6 @@ from wrt.accel.queries.arguments import Shape, WorldIds, check_world, rays_of, r
 from wrt.accel.queries.hit_points import HitIds, Source, device_scene, part_faces
 from wrt.accel.queries.lists import ALL, BATCH, BATCH_ON_GPU, HIT_KINDS, GpuLists, Mesh, begins, host_lists, rows_of
 from wrt.accel.queries.rays import Rays, arrays_on, filled, host_arrays
-from wrt.accel.snapshot import Snapshot
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import upload
@@ -149,7 +148,9 @@ class ListQuery:
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, one traversal without lists is enough."""
-        found = self._each(ALL, lambda lists, begin, counts: counts, stores_once(self.snapshot))
+        geometry = self.snapshot.geometry
+        triangles = sum(map(len, geometry.parts if isinstance(geometry, InstancedGeometry) else [geometry]))
+        found = self._each(ALL, lambda lists, begin, counts: counts, self.snapshot.stats.references == triangles)
         return found[0] if len(found) == 1 else np.concatenate([np.zeros(0, np.int64), *found])
 
     def converted(self, values: np.ndarray) -> Array:
@@ -175,7 +176,6 @@ class ListQuery:
                 self.touches[some] = counts < 0
                 counts = np.maximum(counts, 0)
             out[i] = take(lists, firsts[i], counts.astype(np.int64))
-            lists.release()
 
         if self.device.is_cpu:
             free = host_lists(self.snapshot.structure)
@@ -184,12 +184,6 @@ class ListQuery:
             for i in range(len(firsts)):
                 find(GpuLists(self.device), i)
         return out
-
-
-def stores_once(snapshot: Snapshot) -> bool:
-    """Return whether each triangle is in one leaf only."""
-    parts = snapshot.geometry.parts if isinstance(snapshot.geometry, InstancedGeometry) else [snapshot.geometry]
-    return bool(snapshot.stats.references == sum(map(len, parts)))
 
 
 @overload

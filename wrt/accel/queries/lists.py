@@ -133,7 +133,7 @@ class HostLists:
         self.filler.launch()
 
     def copy(self, begin: np.ndarray, hits: Any) -> None:
-        """Copy the list of ray i to `hits`, a record of HitArrays, from begin[i] on."""
+        """Copy the list of ray i to `hits`, a record of HitArrays, from begin[i] on, and give the second lists' memory back."""
         n = len(begin)
         self.begin[:n] = begin
         self.copier.set(2, array_record(self.begin))
@@ -142,6 +142,7 @@ class HostLists:
         for lists in (self.lists, self.more) if self.kept else (self.lists,):
             self.copier.set(1, lists)
             self.copier.launch()
+        self.kept = ()
 
     def hits(self, counts: np.ndarray) -> list[np.ndarray]:
         """Return t, u, v and prim_id of all hits, one list after another. counts: (n,), lengths of the lists."""
@@ -152,10 +153,6 @@ class HostLists:
             packed = struct_record(HitArrays, out)
         self.copy(first[:-1], packed)
         return out if out is not self.out else [array[:total].copy() for array in out]
-
-    def release(self) -> None:
-        """Give the second lists' memory back."""
-        self.kept = ()
 
 
 @made_once
@@ -209,6 +206,3 @@ class GpuLists:
         out = [wp.empty(rows_of(first[-1]), dtype=kind, device=self.device) for kind in HIT_KINDS]
         self.copy(first[:-1], filled(HitArrays, out))
         return out
-
-    def release(self) -> None:
-        self.lists = []
