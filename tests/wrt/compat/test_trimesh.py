@@ -17,7 +17,6 @@ from wrt.compat.trimesh import RayMeshIntersector
 from wrt.kernels.hit_lists import FEW
 from wrt.scene import shapes
 
-TRIMESH_DIRECTION = np.array([0.4395064455, 0.617598629942, 0.652231566745])  # in which its rule looks first
 DOWN = np.array([[0.0, 0.0, -1.0]])
 
 

@@ -176,9 +176,6 @@ def test_a_structure_answers_after_an_error(ball: Accelerator) -> None:
         assert bits(ball.closest_hit(origins, directions, threads=2)) == expected
 
 
-# --- several structures and threads -----------------------------------------------------------------------------------
-
-
 # --- what a call costs ------------------------------------------------------------------------------------------------
 
 
