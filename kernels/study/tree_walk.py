@@ -55,10 +55,8 @@ class Work:
     leaves: int  # Leaves fetched.
     boxes: int  # Boxes tested.
     tests: int  # Primitives tested.
-    pushes: int
-    waiting: int  # Largest number of entries that waited.
+    full: int  # 1 if the stack or queue had no room for an entry.
     prim_id: int  # The hit, -1 for a miss.
-    t: float
 
 
 @wp.struct
@@ -117,7 +115,7 @@ def write_fetch(log: WalkLog, i: int, work: Work, reference: int, entered: int):
 @kernel
 def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, first_ray: int, scratch: wp.array(dtype=wp.uint64),
          log: WalkLog):
-    """Trace ray first_ray + tid. scratch: QUEUE entries for each thread. A full queue sets log.work[i].waiting to QUEUE + 1."""
+    """Trace ray first_ray + tid. scratch: QUEUE entries for each thread. A full queue ends the walk, and sets log.work[i].full."""
     i = first_ray + wp.tid()
     base = wp.tid() * QUEUE
     ray = make_ray(rays.origin[i], rays.direction[i])
@@ -142,13 +140,11 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
                 work.boxes += wp.where(tree.children[reference * tree.width + slot] != EMPTY, 1, 0)
             write_fetch(log, i, work, reference, n)
             if tail - head + n > QUEUE:
-                work.waiting = QUEUE + 1
+                work.full = 1
                 break
             for j in range(n):
                 scratch[base + tail % QUEUE] = keys[j]
                 tail = tail + 1
-                work.pushes += 1
-            work.waiting = wp.max(work.waiting, tail - head)
         found = bool(False)
         while tail > head and not found:
             key = wp.uint64(0)
@@ -164,5 +160,4 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
         if not found:
             break
     work.prim_id = wp.where(best.prim_id == NO_HIT, -1, best.prim_id)
-    work.t = wp.where(best.prim_id == NO_HIT, float(wp.inf), best.t)
     log.work[i] = work

@@ -1,14 +1,19 @@
-"""What a claim is: a published number, its source and set-up, and the function that repeats it. CLAIMS is the registry."""
+"""`python -m wrt bench claims`: published claims about ray tracing hardware, repeated with exact counts.
 
-from collections.abc import Callable, Iterator, Mapping
+A claim is a published number, its source and set-up, and the function that repeats it. CLAIMS is the registry."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar, cast
 
 import numpy as np
 
 from wrt.core.registry import Registry
 from wrt.core.types import PathLike
-from wrt.lab.claims.scenes import PATH, Scene, open_scene
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, tabled
+from wrt.lab.claims import Claims as Plan
+from wrt.lab.claims.scenes import PATH, Scene, open_scene, scene_files
 from wrt.lab.claims.walks import Rays, Rules, Tree, Walk, build_tree, tree_of, walk
 from wrt.scene.mesh import Mesh
 
@@ -23,27 +28,21 @@ class Figure:
 
     what: str  # What is counted, with its scene.
     ours: float
-    published: float | tuple[float, float] | None = None  # A number or the ends of a range; None for a finding of wrt's own.
+    published: float | tuple[float, float]  # A number or the ends of a range.
     unit: str = ""  # Of both numbers; "ratio" if 1 means no change.
     differences: str = ""  # Of set-up.
     reason: str = ""  # What a measurement says about the difference.
 
     @property
-    def ratio(self) -> float | None:
+    def ratio(self) -> float:
         """Ours over the published number, or over the nearer end of a range; 1 within the range."""
-        if self.published is None:
-            return None
-        low, high = self.published if isinstance(self.published, tuple) else (self.published, self.published)
-        nearer = float(np.clip(self.ours, low, high))
+        nearer = float(np.clip(self.ours, *np.broadcast_to(self.published, 2)))
         return 1.0 if self.ours == nearer else self.ours / nearer if nearer != 0.0 else np.inf
 
     @property
     def verdict(self) -> str:
-        """Return "own finding", "differs" or "agrees": within the factor, and for the unit "ratio" on the same side of 1."""
-        if self.published is None or self.ratio is None:
-            return "own finding"
-        low = self.published[0] if isinstance(self.published, tuple) else self.published
-        opposite = self.unit == "ratio" and (self.ours - 1.0) * (low - 1.0) < 0.0
+        """Return "differs" or "agrees": within the factor AGREES, and for the unit "ratio" on the same side of 1."""
+        opposite = self.unit == "ratio" and (self.ours - 1.0) * (np.min(self.published) - 1.0) < 0.0
         return "agrees" if 1.0 / AGREES <= self.ratio <= AGREES and not opposite else "differs"
 
 
@@ -83,7 +82,7 @@ class Study:
 
     def ttp(self, name: str, workload: str = PATH, rules: Rules = TTP_RULES) -> Walk:
         """Return the logged walk of bvh6 by the rays of a workload."""
-        return self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules, log=True))
+        return self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules))
 
     def rays(self, name: str, workload: str = PATH) -> Rays:
         return self.scene(name).workloads[workload]
@@ -98,5 +97,51 @@ class Study:
 
 CLAIMS: Registry[Claim] = Registry("claim", {
     name: f"wrt.lab.claims.counted:{name.upper().replace('-', '_')}"
-    for name in ("ttp-nodes", "ttp-breadth", "ttp-queue", "coop-rt", "repacking", "cwbvh", "eight-bits", "machines", "turing")},
+    for name in ("ttp-nodes", "ttp-breadth", "ttp-queue", "coop-rt", "repacking", "cwbvh", "eight-bits", "machines")},
     "wrt.claims")
+
+TITLE = "Published claims, repeated"
+COLUMNS: Columns = {"claim": "{claim}", "what": "{what}", "unit": "{unit}", "ours": "{ours:.4g}",
+                    "published": lambda row: shown(row.published), "ratio": "{ratio:.2f}", "verdict": "{verdict}"}
+LEGEND = f"""\
+published: a number, or the two ends of a range; ratio: ours over it, 1 within a range. agrees: within a factor of {AGREES:g},
+and on the same side of 1 for a unit of ratio. differs: the list of sources says what a measurement shows about it. In brackets after a
+source: read in the original, quoted by others, or the abstract alone. Generated scenes stand in for scenes without a file. Nothing is
+timed: equal options give equal rows."""
+
+
+def shown(published: float | tuple[float, float]) -> str:
+    """Write a published number or range."""
+    return " to ".join(f"{value:.4g}" for value in np.atleast_1d(published))
+
+
+def groups(plan: Plan) -> Groups:
+    study = Study(scene_files(plan.scene), plan.side)
+    return (partial(claim_rows, study, name) for name in dict.fromkeys(plan.names) or CLAIMS)
+
+
+def claim_rows(study: Study, name: str) -> list[Row]:
+    claim = CLAIMS[name]
+    return [Row(claim=name, **vars(figure), ratio=figure.ratio, verdict=figure.verdict, source=claim.source, setup=claim.setup,
+                sure=claim.sure) for figure in claim.measure(study)]
+
+
+def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
+    """Return the table of numbers, and a list with the source and set-up of each claim, and what differs for each number."""
+    lines = []
+    for (claim, source, sure, setup), group in grouped(rows, "claim", "source", "sure", "setup").items():
+        lines.append(f"- **{claim}**: {source} ({sure}). Published set-up: {setup}.")
+        for (differences, reason), same in grouped(group, "differences", "reason").items():
+            texts = (differences, f"measured: {reason}" if reason else "")
+            lines.append(f"  - *{'; '.join(row.what for row in same)}*: {'; '.join(filter(None, texts))}")
+    agree = facts(rows, plan)["agree"]
+    return [tabled(COLUMNS, rows, "Compared numbers", f"{agree} of {len(rows)} numbers agree."),
+            Part("Sources, differences of set-up, and what explains them", "\n".join(lines))]
+
+
+def line(row: Row) -> str:
+    return f"{row.claim}: {row.what}: {row.ours:.4g} {row.unit}, published {shown(row.published)}: {row.verdict}"
+
+
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
+    return {"compared": len(rows), "agree": sum(row.verdict == "agrees" for row in rows)}

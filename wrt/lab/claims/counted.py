@@ -6,14 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from wrt.accel.scenes.build import build
-from wrt.lab.bench.rays import counters_of, ray_sets
+from wrt.lab.bench.rays import counters_of
 from wrt.lab.claims.claim import Claim, Figure, Study
 from wrt.lab.claims.scenes import AO, BOUNCES, PATH, SHADOW
 from wrt.lab.claims.walks import Rays, Rules, Walk, walk
-from wrt.lab.rtcore.meshes import in_warps
-from wrt.lab.rtcore.model import RANGE, Work, predict, sensitivity, span, sweep, trace_rays
+from wrt.lab.rtcore.model import WARP, Work, longest_of, predict
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.warps import WARP, longest_of
 
 TTP = "Tozlu, Naithani, Zhou: TTP, ISCA 2026, arXiv 2605.16253"
 SETUP = ("LumiBench, path tracing, 128 x 128, one sample a pixel, all rays; nodes of 6 children in 64 bytes, one primitive a leaf; children"
@@ -180,12 +178,10 @@ def cwbvh(study: Study) -> Iterator[Figure]:
             counters = counters_of(accel, diffuse(study.rays(name)))
             sizes[structure] = accel.stats.bytes / len(geometry)
             moved[structure] = float((counters.node_bytes.astype(np.float64) + counters.primitive_bytes).mean())
-        numbers = (f"bytes a triangle {sizes['bvh2']:.0f} to {sizes['bvh8c']:.0f}, triangles included; bytes a diffuse ray"
-                   f" {moved['bvh2']:.0f} to {moved['bvh8c']:.0f}")
         yield Figure(f"memory of bvh8c over bvh2, {name}", 100.0 * sizes["bvh8c"] / sizes["bvh2"], (35.0, 60.0), "%",
                      f"{study.differences(name, 'their own scenes')}; nodes of 96 bytes with references instead of 80; triangles of 40"
-                     " bytes count", numbers)
-        yield Figure(f"bytes a diffuse ray of bvh8c over bvh2, {name}", 100.0 * moved["bvh8c"] / moved["bvh2"], None, "%", "", numbers)
+                     " bytes count", f"bytes a triangle {sizes['bvh2']:.0f} to {sizes['bvh8c']:.0f}, triangles included; bytes a diffuse"
+                     f" ray {moved['bvh2']:.0f} to {moved['bvh8c']:.0f}")
 
 
 def eight_bits(study: Study) -> Iterator[Figure]:
@@ -194,7 +190,7 @@ def eight_bits(study: Study) -> Iterator[Figure]:
     warp = np.unique(rays.warp, return_inverse=True)[1]
     alone, shared = [], []
     for bits, node, triangle in zip((32, 8), NODE, TRIANGLE, strict=True):
-        log = walk(study.tree("sponza", 8, 8, bits), rays, Rules(), log=True)
+        log = walk(study.tree("sponza", 8, 8, bits), rays, Rules())
         alone.append(float((log.counts["inner"] * node + log.counts["tests"].astype(np.float64) * triangle).mean()))
         inner = np.unique(warp[log.owner] * (1 << 32) + log.fetch) % (1 << 32) < 1 << 31  # of each node or leaf that a warp fetches
         tests = log.counts["tests"].sum() / max(log.counts["leaves"].sum(), 1)
@@ -231,19 +227,6 @@ def machines(study: Study) -> Iterator[Figure]:
                      f" {loose['boxes'].sum() / loose['tests'].sum():.1f}")
 
 
-def turing(study: Study) -> Iterator[Figure]:
-    """Predict rays a second of an RTX 2080 Ti for primary rays, and rank the assumptions by their weight."""
-    scene = study.scene("bunny")
-    accel = build(scene.geometry, "bvh2")
-    rays = in_warps(accel, ray_sets(accel, 4 * scene.side**2))["primary"]
-    work, gpu = trace_rays(accel, "primary", rays.origins, rays.directions), GPUS["rtx2080ti"]
-    low, high = span(sweep(work, gpu, gpu.core, RANGE))
-    weights = ", ".join(f"{name} {factor:.2f}x" for name, factor in sensitivity(work, gpu, gpu.core).items())
-    yield Figure("primary rays of an RTX 2080 Ti, bvh2", predict(work, gpu, gpu.core).rays_per_second / 1e9, 10.0, "Grays/s",
-                 f"scene {scene.shown}: {len(scene.geometry)} triangles; the rates of the tests are assumed (docs/rt_core.md)",
-                 f"range {low / 1e9:.2f} to {high / 1e9:.2f} over {', '.join(RANGE)}; factor of each assumption alone: {weights}")
-
-
 TTP_NODES = Claim(f"{TTP}, Table I", SETUP, "read", ttp_nodes)
 TTP_BREADTH = Claim(f"{TTP}, Table I", f"{SETUP}; a queue in place of the stack", "read", ttp_breadth)
 TTP_QUEUE = Claim(f"{TTP}, Figure 7", f"{SETUP}; a queue in place of the stack; mean of 16 scenes", "read", ttp_queue)
@@ -259,4 +242,3 @@ EIGHT_BITS = Claim("Grauer, Hanika, Dachsbacher, arXiv 2505.24653 (2025)", "8 ch
 MACHINES = Claim("Chips and Cheese: Intel Arc B580 (2025-03), AMD RX 9070 (2025-04)",
                  "hardware counters: Arc 39.5 steps a ray, box and triangle units in use 1.55 and 1.04 %; RX 9070 111.76 to 19.61 and RX"
                  " 6900 XT 38.8 to 10.76 box and triangle tests", "read", machines)
-TURING = Claim("NVIDIA Turing GPU Architecture, WP-09183-001 (2018)", "10 Grays/s, primary rays of simple scenes", "read", turing)

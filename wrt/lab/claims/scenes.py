@@ -16,7 +16,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.meshes import terrain
 from wrt.lab.bench.rays import OFFSET, ball_around, through_pixels, unit
 from wrt.lab.claims.walks import Rays
-from wrt.lab.rtcore.warps import WARP, blocks
+from wrt.lab.rtcore.model import WARP, blocks
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, merged, torus, tube
 

@@ -103,8 +103,8 @@ def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: int = 32
     return tree_of(geometry, wide)
 
 
-def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False) -> Walk:
-    """Trace rays by `rules`, with a log if asked. Raise InputError if a queue needs more than QUEUE entries."""
+def walk(tree: Tree, rays: Rays, rules: Rules) -> Walk:
+    """Trace rays by `rules`, once to count and once with a log. Raise InputError if a queue needs more than QUEUE entries."""
     cpu, n, given = start("cpu"), len(rays), kernels.StudyRays()
     given.origin, given.direction = (upload(np.ascontiguousarray(each), wp.vec3, cpu) for each in (rays.origins, rays.directions))
     given.t_max = upload(rays.t_max.astype(np.float32), wp.float32, cpu)
@@ -119,11 +119,8 @@ def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False) -> Walk:
         return on_host(out).copy()
 
     counts = trace(kernels.WalkLog())
-    if (counts["waiting"] > int(QUEUE)).any():
+    if counts["full"].any():
         raise InputError(f"a ray needs more than {int(QUEUE)} entries in its queue")
-    none = np.zeros(0, np.int64)
-    if not log:
-        return Walk(counts, none, none, none)
     first = np.concatenate([[0], np.cumsum(counts["inner"].astype(np.int64) + counts["leaves"])])
     record = kernels.WalkLog()
     record.fetch_first = upload(first, wp.int64, cpu)

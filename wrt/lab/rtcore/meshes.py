@@ -16,9 +16,8 @@ from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, mesh_name, tabled
 from wrt.lab.rtcore import RtCore as Plan
 from wrt.lab.rtcore.model import LEGEND as LEGEND
-from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, simt, trace_rays
+from wrt.lab.rtcore.model import MODEL_COLUMNS, WARP, blocks, model_row, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
-from wrt.lab.rtcore.warps import WARP, blocks
 from wrt.scene.mesh import Mesh
 
 

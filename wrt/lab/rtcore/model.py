@@ -18,8 +18,10 @@ from wrt.core.types import ArrayLike
 from wrt.lab.bench.report import Columns, Row, tabled, tables_page
 from wrt.lab.rtcore.caches import LINE, Misses, Prefetches, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, SWEEPS, Core, Gpu
-from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
+WARP = 32
+BLOCK = (8, 4)  # pixels of a warp: columns, rows
+MORTON_BITS = 10  # bits of each coordinate in a Morton code
 TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
 
@@ -107,6 +109,55 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
         low, high = span(sweep(work, gpu, core, (name,)))
         factors[name] = high / low
     return dict(sorted(factors.items(), key=lambda item: -item[1]))
+
+
+def blocks(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the warp and the lane of each pixel, (height * width,) each: warps are blocks of 8 x 4 pixels, row by row."""
+    y, x = np.divmod(np.arange(width * height), width)
+    across = -(-width // BLOCK[0])
+    return y // BLOCK[1] * across + x // BLOCK[0], y % BLOCK[1] * BLOCK[0] + x % BLOCK[0]
+
+
+def packed(n: int) -> np.ndarray:
+    """Return the warp of each of n successive rays, (n,); all warps but the last are full."""
+    return np.arange(n) // WARP
+
+
+def efficiency(cost: np.ndarray, warp: np.ndarray) -> float:
+    """Return the SIMT efficiency, 0 to 1; it is 1 if all costs are 0. cost, warp: (N,) of each ray.
+    A warp occupies its 32 lanes for the cost of its costliest ray."""
+    longest = longest_of(cost, warp)
+    total = WARP * float(longest.sum())
+    return float(cost.sum()) / total if total > 0.0 else 1.0
+
+
+def longest_of(cost: np.ndarray, warp: np.ndarray) -> np.ndarray:
+    """Return the largest cost of a ray in each warp, (W,) float64. cost: (N,), not negative."""
+    out = np.zeros(int(warp.max(initial=-1)) + 1)
+    np.maximum.at(out, warp, cost)
+    return out
+
+
+def by_coherence(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return an order, (N,) int64, in which similar rays are neighbours.
+    Sort by the octant of the direction, then along Morton curves through the origins and through the directions. Sources:
+    Pharr et al. 1997, Garanzha and Loop 2010."""
+    octant = (directions < 0.0) @ np.array([4, 2, 1])
+    unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    return np.lexsort((morton(unit), morton(origins), octant))
+
+
+def morton(points: np.ndarray) -> np.ndarray:
+    """Return the position of each point on a Morton curve through the points' box, (N,) int64."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    lo, extent = points.min(axis=0), np.ptp(points, axis=0)
+    cell = (points - lo) / np.where(extent > 0.0, extent, 1.0) * ((1 << MORTON_BITS) - 1)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            code |= (cell[:, axis].astype(np.int64) >> bit & 1) << (3 * bit + axis)
+    return code
 
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:

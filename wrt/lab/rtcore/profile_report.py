@@ -11,10 +11,9 @@ from wrt.core.errors import InputError
 from wrt.core.files import check_writable, write_bytes
 from wrt.core.tables import Rows
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled
-from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, Work, model_page, model_row, simt
+from wrt.lab.rtcore.model import LEGEND, MODEL_COLUMNS, SIMT_COLUMNS, WARP, Work, blocks, model_page, model_row, simt
 from wrt.lab.rtcore.parameters import Gpu
-from wrt.lab.rtcore.profiler import KINDS, PICTURES, TITLES, Profile
-from wrt.lab.rtcore.warps import WARP, blocks
+from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile
 from wrt.picture.image import write_codes, write_exr
 
 GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflection", "refraction", "straight"), "all": KINDS}
@@ -56,7 +55,6 @@ def work_of(profile: Profile, group: str) -> Work | None:
     return Work(group, Counters(rays.counts[rows], begin, rays.address[fetch], rays.size[fetch]), warp)
 
 
-PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, REPORT = "counters.exr", "profile.md"
 DEPTHS: Columns = {
     "depth": "{depth}", "kind": "{kind}", "rays": "{probes}", "hits": lambda row: f"{row.hits / row.probes:.0%}",
@@ -64,19 +62,6 @@ DEPTHS: Columns = {
        {"nodes": "nodes", "boxes": "boxes", "triangles": "primitives", "leaves": "leaves"}.items()},
     "bytes": lambda row: f"{(row.node_bytes + row.primitive_bytes) / row.probes:.0f}",
     "lines": lambda row: f"{row.lines / row.probes:.1f}", "largest stack": "{stack}"}
-
-
-def percentiles(profile: Profile) -> Part:
-    """Return the table of mean and percentiles of each counter over the rays, by kind of ray."""
-    lines = []
-    for name in PER_RAY:
-        values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
-        for i, kind in enumerate(KINDS):
-            chosen = values[profile.rays.kind == i]
-            if len(chosen):
-                shares = np.percentile(chosen, (50, 90, 99, 99.9))
-                lines.append((TITLES[name], kind, f"{chosen.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{chosen.max()}"))
-    return Part("Cost per ray", "", ("counter", "rays", "mean", "50%", "90%", "99%", "99.9%", "largest"), lines)
 
 
 def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
@@ -101,7 +86,7 @@ def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
     recorded = f"{len(rays.trace_rows) / max(len(rays), 1):.0%} of the rays, in whole tiles"
     return markdown([
         Part("", head), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means over the rays)"),
-        percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({recorded})"), Part("", LEGEND),
+        tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({recorded})"), Part("", LEGEND),
         tabled(SIMT_COLUMNS, rows, "SIMT efficiency",
                "As they come: warps of 8 x 4 pixels. Packed: full warps. Sorted: full warps of rays sorted by origin and direction.")])
 

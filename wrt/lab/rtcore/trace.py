@@ -23,9 +23,8 @@ from wrt.core.types import ArrayLike, PathLike
 from wrt.kernels.traverse import steps as of
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
 from wrt.lab.rtcore.caches import Prefetches
-from wrt.lab.rtcore.model import Prediction, Work, predict
+from wrt.lab.rtcore.model import Prediction, Work, packed, predict
 from wrt.lab.rtcore.parameters import BASE, GPUS, Core
-from wrt.lab.rtcore.warps import packed
 
 TESTS = ("none", "box", "plane", "cell", "primitive")
 NONE, BOX, PLANE, CELL, PRIMITIVE = range(len(TESTS))
@@ -38,59 +37,29 @@ PER_PREFETCH = ("prefetch_after", "prefetch_address", "prefetch_size")
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Fetches of N rays through a structure, M in all. Successive blocks of 32 rays are warps.
+    """Fetches of N rays through a structure, M in all. Successive blocks of 32 rays are warps."""
 
-    Attributes
-    ----------
-    structure : str
-        Name of the structure.
-    origin, direction : (N, 3) float32
-        The rays.
-    t, prim_id : (N,) float32, int32
-        Closest hits, as in `Hits`.
-    counts : (N,) structured array
-        Counters, as in `Counters.counts`.
-    root_boxes : (N,) int16
-        Boxes tested before the first fetch.
-    first : (N + 1,) int64
-        Ray i has the fetches first[i] .. first[i + 1] - 1.
-    address, size : (M,) int64
-        In bytes. Nodes begin at address 0, primitives at 2^40.
-    depth : (M,) int16
-        Number of links from the root to the node or leaf; -1 if the structure records no children.
-    test, tests : (M,) int16
-        What is tested after the fetch, an index into `TESTS`, and how many of these: children's boxes, or 1.
-    result : (M,) int16
-        Of a node: number of children that the ray enters. Of a primitive: 0 missed, 1 before t_min, 2 behind the closest hit so far,
-        3 new closest hit.
-    child_first : (M + 1,) int64
-        Fetch j has the children child_first[j] .. child_first[j + 1] - 1, in the order of the node.
-    child_address, child_size : (K,) int64
-        Node, or all primitives of the leaf.
-    child_t : (K,) float32
-        Where the ray enters the child; inf if it does not.
-    prefetch_after, prefetch_address, prefetch_size : (P,) int64
-        Prefetches, of which a new trace has none: fetch that starts it, ascending; bytes.
-    """
-
-    structure: str
-    origin: np.ndarray
+    structure: str  # Its name.
+    origin: np.ndarray  # origin, direction: the rays, (N, 3) float32.
     direction: np.ndarray
-    t: np.ndarray
+    t: np.ndarray  # t, prim_id: closest hits, (N,), as in `Hits`.
     prim_id: np.ndarray
-    counts: np.ndarray
-    root_boxes: np.ndarray
-    first: np.ndarray
-    address: np.ndarray
+    counts: np.ndarray  # (N,) counters, as in `Counters.counts`.
+    root_boxes: np.ndarray  # (N,) int16, boxes tested before the first fetch.
+    first: np.ndarray  # (N + 1,) int64. Ray i has the fetches first[i] .. first[i + 1] - 1.
+    address: np.ndarray  # address, size: (M,) int64, in bytes. Nodes begin at address 0, primitives at 2^40.
     size: np.ndarray
-    depth: np.ndarray
-    test: np.ndarray
-    tests: np.ndarray
+    depth: np.ndarray  # (M,) int16, links from the root to the node or leaf; -1 if the structure records no children.
+    test: np.ndarray  # (M,) int16, index into TESTS: what is tested after the fetch.
+    tests: np.ndarray  # (M,) int16, how many of these: children's boxes, or 1.
+    # (M,) int16. Of a node: number of children that the ray enters. Of a primitive: 0 missed, 1 before t_min, 2 behind the closest hit so
+    # far, 3 new closest hit.
     result: np.ndarray
-    child_first: np.ndarray
-    child_address: np.ndarray
+    child_first: np.ndarray  # (M + 1,) int64. Fetch j has the children child_first[j] .. child_first[j + 1] - 1, in the order of the node.
+    child_address: np.ndarray  # child_address, child_size: (K,) int64, node or all primitives of the leaf.
     child_size: np.ndarray
-    child_t: np.ndarray
+    child_t: np.ndarray  # (K,) float32, where the ray enters the child; inf if it does not.
+    # Prefetches, (P,) int64, of which a new trace has none: fetch that starts it, ascending; bytes.
     prefetch_after: np.ndarray
     prefetch_address: np.ndarray
     prefetch_size: np.ndarray

@@ -24,9 +24,8 @@ from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
 from wrt.lab.bench.report import run as run
 from wrt.lab.rtcore import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
-from wrt.lab.rtcore.model import Work, predict, simt
+from wrt.lab.rtcore.model import Work, by_coherence, packed, predict, simt
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
-from wrt.lab.rtcore.warps import by_coherence, packed
 
 FRAME_BYTES = 16  # of a node's frame: corner (12), and an exponent of the step for each axis
 REFERENCE_BYTES = 16  # of the children's references in a binary node, as in Bvh2Node

@@ -52,12 +52,6 @@ def test_closed_forms() -> None:
     assert not replay(same_set, cache).any() and replay(same_set, Cache(64 * LINE, 64)).sum() == 45
 
 
-def test_a_larger_cache_of_one_set_never_hits_less() -> None:
-    line = np.random.default_rng(2).integers(0, 60, 3000)
-    hits = [replay(line, Cache(ways * LINE, ways)).sum() for ways in (1, 2, 7, 20, 60)]
-    assert hits == sorted(hits) and hits[-1] == 3000 - len(np.unique(line))
-
-
 def test_lines_of_fetches() -> None:
     address, size = np.array([0, 100, 128, 0]), np.array([128, 40, 1, 300])
     line, fetch = lines_of(address, size)
@@ -68,21 +62,6 @@ def test_lines_of_fetches() -> None:
 def simulate(warps: tuple[np.ndarray, Counters], machine: tuple[int, int, Cache, Cache], warm: bool = False) -> Misses:
     sms, slots, l1, l2 = machine
     return second_level(first_level(*warps, sms, slots, l1), l2, warm)
-
-
-def test_warps_wait_for_a_slot() -> None:
-    """Warps of one ray that touch a new line in each round: every access misses, in the round in which it is made."""
-    length = [5, 7, 2, 1, 4, 9]
-    first = np.concatenate([[0], np.cumsum(length)])
-    warps = made(np.arange(6), first, np.arange(28) * LINE, np.full(28, 4))
-    missed = first_level(*warps, 2, 1, Cache(LINE, 1))
-    begin = {0: 0, 2: 5, 4: 7, 1: 0, 3: 7, 5: 8}  # SM 0 runs warps 0, 2, 4; SM 1 the others
-    assert missed.accesses == 28 and missed.line.tolist() == [i for w in begin for i in range(first[w], first[w + 1])]
-    assert missed.time.tolist() == [begin[w] + k for w in begin for k in range(length[w])]
-    missed = first_level(*warps, 1, 2, Cache(LINE, 1))
-    begin = {0: 0, 1: 0, 2: 5, 3: 7, 4: 7, 5: 8}  # two slots: warp 3 in that of 2, and 5 in that of 3
-    assert sorted(zip(missed.time.tolist(), missed.line.tolist(), strict=True)) == sorted(
-        (begin[w] + k, int(first[w]) + k) for w in begin for k in range(length[w]))
 
 
 def test_a_warp_asks_for_a_line_once_a_round() -> None:

@@ -11,9 +11,24 @@ from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE, Counts
 from wrt.lab.rtcore.caches import LINE, Cache
-from wrt.lab.rtcore.model import TERMS, Work, predict, sensitivity, simt, span, sweep, trace_rays
+from wrt.lab.rtcore.model import (
+    TERMS,
+    WARP,
+    Work,
+    blocks,
+    by_coherence,
+    efficiency,
+    longest_of,
+    morton,
+    packed,
+    predict,
+    sensitivity,
+    simt,
+    span,
+    sweep,
+    trace_rays,
+)
 from wrt.lab.rtcore.parameters import GPUS, SWEEPS, Core, Gpu
-from wrt.lab.rtcore.warps import packed
 from wrt.scene.shapes import icosphere
 
 SMALL = Gpu("small", 2, 1e9, 64e9, Cache(64 * LINE, 4), Cache(256 * LINE, 4))  # DRAM: 32 bytes a clock and SM
@@ -95,3 +110,40 @@ def test_published_numbers() -> None:
     gpu = GPUS["rtx2080ti"]
     assert gpu.sms * gpu.clock / 10e9 == pytest.approx(10.5, abs=0.01)
     assert gpu.l2.size == 5632 * 1024 and gpu.l1.size == 96 * 1024
+
+
+def test_efficiency_by_hand() -> None:
+    equal = np.full(64, 7.0)
+    assert efficiency(equal, packed(64)) == 1.0
+    assert efficiency(equal[:40], packed(40)) == 40 / 64  # 24 lanes have no ray
+    one_long = np.ones(32)
+    one_long[5] = 9.0
+    assert efficiency(one_long, packed(32)) == pytest.approx((31 + 9) / (32 * 9))
+    assert longest_of(np.array([1.0, 5.0, 2.0]), np.array([0, 0, 2])).tolist() == [5.0, 0.0, 2.0]
+    assert efficiency(np.zeros(5), packed(5)) == 1.0 and efficiency(np.zeros(0), packed(0)) == 1.0
+
+
+def test_blocks_are_of_eight_by_four_pixels() -> None:
+    warp, lane = blocks(20, 9)
+    assert len(np.unique(warp * WARP + lane)) == 180 and (lane < WARP).all()
+    for w in np.unique(warp):
+        y, x = np.divmod(np.flatnonzero(warp == w), 20)
+        assert np.ptp(y // 4) == 0 and np.ptp(x // 8) == 0
+    assert warp.reshape(9, 20)[8, 19] == warp.max() == 8
+
+
+def test_sorting_puts_like_rays_beside_each_other() -> None:
+    """Two bundles of rays, shuffled together, come apart; the order has every ray once."""
+    rng = np.random.default_rng(2)
+    which = rng.integers(0, 2, 500)
+    origins = np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])[which] + 0.1 * rng.random((500, 3))
+    directions = np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])[which] + 0.1 * rng.random((500, 3))
+    order = by_coherence(origins, directions)
+    assert sorted(order.tolist()) == list(range(500))
+    assert np.count_nonzero(np.diff(which[order])) == 1
+
+
+def test_morton_codes_are_interleaved_bits() -> None:
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
+    assert (np.diff(morton(corners)) > 0).all() and morton(corners)[0] == 0 and morton(corners)[7] == (1 << 30) - 1
+    assert morton(np.zeros((3, 3))).tolist() == [0, 0, 0] and len(morton(np.zeros((0, 3)))) == 0

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import ast
-import importlib
-import importlib.util
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import wrt
-from tests.kernel_tools import machine_code
 from tests.refused import refused
 from tests.rewalk import REWALK, rays
-from wrt.accel.snapshot import Structure
-from wrt.accel.structures import ACCELERATORS
-from wrt.kernels.traverse.common import Units
 from wrt.lab.costs import COUNTERS
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.renderer.options import Progress
-from wrt.renderer.plan import features_of, render_kernel
 from wrt.scene.model import Scene
 from wrt.scene.shapes import box
 
@@ -137,50 +128,6 @@ def test_a_scene_has_its_own_samples_a_mesh_one_and_progress_ends_at_all_samples
     assert [profile(path, size=8).spp for path in (tmp_path / "mirrors.toml", tmp_path / "box.obj", box())] == [3, 1, 1]
     assert [each.done for each in told] == sorted({each.done for each in told}) and len(told) > 2
     assert told[-1].done == told[-1].total == 3 * found.spp * found.size[0] * found.size[1] and told[-1].rays == 3 * len(found.rays)
-
-
-GUARDS = ("if counting:", "if wp.static(counting):", "if wp.static(features.counting):", "if wp.static(features.recording):")
-
-
-def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
-    """A source without counting and recording compiles to the same machine code for Turing, to the last byte."""
-    features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
-    folder = Path(wrt.__file__).parent.parent / "kernels"
-    modules, names = {}, ("paths", "step", "follow_up", "film", "one_ray")
-    for name in names:
-        text = without_counting((folder / ("loops" if name == "one_ray" else "shade") / f"{name}.py").read_text())
-        for other in names:
-            text = text.replace(f"wrt.kernels.shade.{other} ", f"wrt.kernels.bare_{other} ")
-        (tmp_path / f"{name}.py").write_text(text)
-        spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
-        assert spec is not None and spec.loader is not None and "counting" not in text and "features.recording" not in text
-        modules[name] = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = modules[name]
-        spec.loader.exec_module(modules[name])
-    codes, bare = [], modules["one_ray"].make_render_kernel(features, structure, importlib.import_module(features.camera))
-    for kernel in (render_kernel(features, structure), bare):
-        codes.append(machine_code(kernel, tmp_path / str(len(codes))))
-    assert len(codes[0][0]) > 10_000 and codes[0] == codes[1]
-
-
-def without_counting(text: str) -> str:
-    """The source without docstrings, without the blocks that `counting` or `recording` guards, and without the argument `counting`."""
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            node.body = node.body[1:] or [ast.Pass()]
-    out, depth = [], None
-    for line in ast.unparse(tree).splitlines():
-        indent = len(line) - len(line.lstrip())
-        if depth is not None and indent > depth:
-            continue
-        depth = indent if line.strip() in GUARDS else None
-        if depth is None:
-            out.append(line)
-    bare = "\n".join(out) + "\n"
-    for old, new in (("counting: bool", ""), ("(features.counting)", "()"), ("(counting)", "()")):
-        bare = bare.replace(old, new)
-    return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)
 
 
 def test_a_profile_is_written_as_a_table_of_its_rays(scene: Scene, tmp_path: Path) -> None:

@@ -1,20 +1,28 @@
-"""Walks by other rules, and warps that help each other: each against a traversal or a replay in plain Python."""
+"""`bench claims`: walks by other rules and warps that help each other, against plain Python; verdicts, and all claims on small scenes."""
 
 from __future__ import annotations
 
 import itertools
+import json
 from collections import deque
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.command_line import wrt
+from tests.refused import refused
 from tests.rewalk import INF, WalkRay
 from tests.rewalk import rays as with_hits
 from wrt.accel.bvh.six import Bvh6
 from wrt.accel.geometry import Geometry
+from wrt.lab.bench.meshes import terrain
+from wrt.lab.claims import Claims as Plan
+from wrt.lab.claims import scenes
+from wrt.lab.claims.claim import CLAIMS, Figure, Study
 from wrt.lab.claims.counted import helped, parents, repacked
-from wrt.lab.claims.scenes import hall, statue
+from wrt.lab.claims.scenes import PATH, open_scene
 from wrt.lab.claims.walks import Rays, Rules, Tree, build_tree, tree_of, walk
 from wrt.scene.shapes import icosphere
 
@@ -73,7 +81,7 @@ def twin(tree: Tree, i: int, rules: Rules) -> tuple[list[int], list[int], int]:
 @pytest.mark.parametrize(("width", "max_leaf", "bits"), [(2, 1, 32), (6, 1, 8), (8, 5, 12)])
 def test_a_walk_is_that_of_plain_python(width: int, max_leaf: int, bits: int, rules: Rules) -> None:
     tree = build_tree(BALLS, width, max_leaf, bits)
-    log = walk(tree, some_rays(), rules, log=True)
+    log = walk(tree, some_rays(), rules)
     for i in range(len(some_rays())):
         fetches, entered, prim_id = twin(tree, i, rules)
         rows = slice(log.first[i], log.first[i + 1])
@@ -93,7 +101,7 @@ def test_bvh6_counts_what_the_study_counts() -> None:
 
 def test_lanes_that_help_take_the_oldest_entries() -> None:
     rays, tree = some_rays(), build_tree(BALLS, 6)
-    log = walk(tree, rays, Rules(False, False), log=True)
+    log = walk(tree, rays, Rules(False, False))
     parent = parents(log)
     for fetch, of in enumerate(parent):
         assert log.fetch[fetch] in ([0] if of < 0 else tree.wide.children[log.fetch[of]])
@@ -130,5 +138,54 @@ def test_planes_of_fewer_bits_give_larger_boxes_and_the_same_hits() -> None:
     assert (trees[-1].wide.hi - trees[-1].wide.lo)[exists].sum() > 1.05 * (trees[0].wide.hi - trees[0].wide.lo)[exists].sum()
 
 
-def test_generated_scenes_have_the_stated_size() -> None:
-    assert len(statue().faces) == 81_920 and 80_000 < len(hall().faces) < 120_000
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(scenes.STAND_INS, "bunny", ("ball", lambda: icosphere(4)))
+    monkeypatch.setitem(scenes.STAND_INS, "sponza", ("terrain", lambda: terrain(40)))
+
+
+@pytest.mark.parametrize(("ours", "published", "unit", "ratio", "verdict"), [
+    (2.0, 3.0, "nodes", 2.0 / 3.0, "agrees"), (2.0, 3.1, "nodes", 2.0 / 3.1, "differs"), (3.0, 2.0, "nodes", 1.5, "agrees"),
+    (50.0, (30.0, 70.0), "%", 1.0, "agrees"), (80.0, (30.0, 50.0), "%", 1.6, "differs"), (1.1, 0.9, "ratio", 1.1 / 0.9, "differs"),
+    (0.0, 0.0, "rays", 1.0, "agrees"), (1.0, 0.0, "rays", np.inf, "differs"), (-10.0, (50.0, 70.0), "%", -0.2, "differs")])
+def test_a_number_agrees_within_the_factor_and_in_order(ours: float, published: float | tuple[float, float], unit: str, ratio: float,
+                                                        verdict: str) -> None:
+    figure = Figure("", ours, published, unit)
+    assert figure.verdict == verdict and figure.ratio == pytest.approx(ratio)
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_every_claim_says_what_differs_and_why(name: str, small: None) -> None:
+    claim = CLAIMS[name]
+    figures = list(claim.measure(Study(side=16)))
+    assert figures and claim.source and claim.setup and claim.sure in ("read", "quoted", "abstract")
+    for figure in figures:
+        assert np.isfinite(figure.ours) and figure.what and figure.differences
+        assert figure.verdict == "agrees" or any(letter.isdigit() for letter in figure.reason)  # a measurement, not a guess
+
+
+def test_the_command_takes_a_file_for_a_published_scene(tmp_path: Path, small: None) -> None:
+    ball, path, report = icosphere(4), tmp_path / "bunny.obj", tmp_path / "report.md"
+    path.write_text("\n".join([*("v " + " ".join(map(str, v)) for v in ball.vertices.tolist()),
+                               *("f " + " ".join(map(str, f)) for f in (ball.faces + 1).tolist())]) + "\n")
+    arguments = ["bench", "claims", "repacking", "--side", "16", "--scene", f"bunny={path}"]
+    data = json.loads(wrt(*arguments, "-q", "--json", "-o", report).out)
+    assert data["compared"] == 2 and data["rows"][0]["differences"].startswith(f"scene bunny: {len(ball.faces)} triangles, the caller's")
+    assert "- **repacking**: Chou" in report.read_text() and " of 2 numbers agree" in report.read_text()
+    assert json.loads(wrt(*arguments, "-q", "--json").out)["rows"] == data["rows"]  # nothing is timed
+    assert wrt("bench", "claims", "nonsense").code == 2
+    for wrong in ("bunny", "bunnny=a.ply"):
+        with refused("scene"):
+            Plan(scene=(wrong,))
+
+
+def test_rays_of_paths_start_at_hits_and_stay_in_their_warps(small: None) -> None:
+    scene = open_scene("bunny", None, 24)
+    rays = scene.workloads[PATH]
+    camera = (rays.depth == 0) & (rays.kind == 0)
+    assert camera.sum() == 24 * 24 and (np.diff(rays.warp) >= 0).all() and np.bincount(rays.warp).max() <= 32
+    hits = scene.accel.closest_hit(rays.origins[camera], rays.directions[camera])
+    shadow = (rays.depth == 0) & (rays.kind == 1)
+    assert set(rays.pixel[shadow]) == set(rays.pixel[camera][hits.prim_id >= 0])
+    block = rays.pixel // 24 // 4 * 3 + rays.pixel % 24 // 8
+    assert all(len(set(block[rays.warp == warp])) == 1 for warp in np.unique(rays.warp))
