@@ -5,33 +5,40 @@ from __future__ import annotations
 import os
 import threading
 import time
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Unpack
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import numpy as np
 import warp as wp
 
-from wrt.core.device import memory_of, start, upload
+from wrt.accel.queries.observed import copied
+from wrt.accel.snapshot import WrappedStructure
+from wrt.core.device import memory_of, on_host, start, upload
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.tables import html_table, write_table
+from wrt.core.threads import run_all
 from wrt.core.types import PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.shade.paths import BRANCHES, COATED, REFLECTED
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.observer import SIZE_RANGE, Counts, Recorder
-from wrt.lab.costs import COUNTERS, CostCounter
+from wrt.kernels.warp_private import fields_of
 from wrt.lab.rtcore.caches import distinct_lines
-from wrt.renderer.film import Rectangle
+from wrt.renderer.film import DeviceFilm, Rectangle, Work
 from wrt.renderer.options import OF_A_PROFILE, Options, Progress, RenderOptions, split
 from wrt.renderer.plan import plan_of
+from wrt.renderer.prepare import prepare
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 
 if TYPE_CHECKING:
     from PIL import Image
 
+T = TypeVar("T")
+COUNTERS = tuple(fields_of(Counts))
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
 TITLES = {
@@ -188,72 +195,83 @@ class _Tile:
 
 
 class Profiler:
-    """Make three passes over each tile: count the rays of each pixel, record the rays with their counters, record their fetches."""
+    """Render with a structure that counts its steps and logs its rays, in three passes over each tile: count the rays of each pixel,
+    record the rays with their counters, record their fetches."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
-        device, plan = start(options.device), plan_of(scene, options)
-        plan.require_memory(device)
-        self.counter = CostCounter(plan, device)
-        self.prepared, self.plan = self.counter.prepared, plan
+        self.device, plan = start(options.device), plan_of(scene, options)
+        plan.require_memory(self.device)
+        counting = plan.structure._replace(units=plan.structure.units._replace(observer="sum"))
+        self.plan = replace(plan, structure=WrappedStructure(counting, ray_log), features=replace(plan.features, counting=True))
+        self.prepared = prepare(self.plan, self.device)
 
     def measure(self) -> Profile:
         self.begin, self.done, self.rays, self.lock = time.perf_counter(), 0, 0, threading.Lock()
-        self.films = [self.counter.film() for _ in range(3)]  # one for each pass; all three get the same samples
+        settings, (x0, y0, x1, y1) = self.plan.scene.settings, self.plan.crop
+        # One film for each pass; all three get the same samples.
+        self.films = [DeviceFilm(settings, self.plan.crop, self.device, self.plan.options.seed) for _ in range(3)]
         tiles: list[_Tile] = []
-        self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
+        self._each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
-        if total * BYTES_OF_RAY > 0.5 * memory_of(self.prepared.device):
+        if total * BYTES_OF_RAY > 0.5 * memory_of(self.device):
             raise InputError(f"a profile of {total / 1e6:.0f} million rays needs {total * BYTES_OF_RAY / 2**30:.0f} GiB, more than half"
                              " of the memory; use a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))
-        self.counter.each(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
+        self._each(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
         seconds = {**self.prepared.seconds, "trace": time.perf_counter() - self.begin}
-        x0, y0, x1, y1 = self.plan.crop
-        return Profile(self.plan.scene.name, (x1 - x0, y1 - y0), self.plan.scene.settings.spp,
-                       self.films[0].pixels_and_variance()[0], self._gather(tiles), self.prepared.accel, seconds)
+        return Profile(self.plan.scene.name, (x1 - x0, y1 - y0), settings.spp, self.films[0].pixels_and_variance()[0], self._gather(tiles),
+                       self.prepared.accel, seconds)
+
+    def _each(self, work: Callable[[T], None], items: Iterable[T]) -> None:
+        """Call `work` with each item, on all threads."""
+        run_all([partial(work, item) for item in items], 1 if self.device.is_cuda else self.prepared.threads)
+
+    def _trace(self, rectangle: Rectangle, film: int, used: np.ndarray | None = None,
+               first_fetch: np.ndarray | None = None) -> tuple[Recorder, ray_log.RayLog]:
+        """Trace all samples of a tile. With `used`, the number of rays of each pixel, count and log each ray, else sum over pixels.
+        first_fetch: index of each ray's first fetch, and the end; None: record no fetches."""
+        recorder, log = Recorder(), ray_log.RayLog()
+        zeros = partial(wp.zeros, device=self.device)
+        pixels = rectangle[2] * rectangle[3]
+        n = pixels if used is None else int(used.sum(dtype=np.int64))
+        recorder.counts, log.used = zeros(n, dtype=Counts), zeros(pixels, dtype=wp.int32)
+        if used is not None:
+            log.first, log.rays = upload(np.cumsum(used, dtype=np.int64) - used, wp.int64, self.device), zeros(n, dtype=ray_log.LoggedRay)
+        if first_fetch is not None:
+            recorder.first = upload(first_fetch, wp.int64, self.device)
+            recorder.fetches = zeros(int(first_fetch[-1]), dtype=wp.int64)
+        data = copied(self.prepared.accel.data)  # each tile has its own recorder
+        data.recorder = recorder
+        accel = self.plan.structure.struct()
+        accel.accel, accel.log = data, log
+        self.prepared.launch(self.films[film], accel)(Work(rectangle, 0, self.plan.scene.settings.spp))
+        return recorder, log
 
     def _count(self, rectangle: Rectangle) -> _Tile:
-        used, counts = self.counter.totals(rectangle, self.films[0])
-        fetches = int(counts["nodes"].sum(dtype=np.int64) + counts["primitives"].sum(dtype=np.int64))
+        recorder, log = self._trace(rectangle, 0)
+        used = log.used.numpy().copy()
         self._report(rectangle, 1, int(used.sum(dtype=np.int64)))
-        return _Tile(rectangle, used.copy(), fetches)
-
-    def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
-        """Report to `progress` that a tile has finished `runs` more passes. rays: number of rays of one pass."""
-        progress, settings = self.plan.options.progress, self.plan.scene.settings
-        if progress is not None:
-            with self.lock:
-                self.done += runs * rectangle[2] * rectangle[3] * settings.spp
-                self.rays += runs * rays
-                progress(Progress(self.done, 3 * self.plan.area * settings.spp, self.rays, time.perf_counter() - self.begin))
+        return _Tile(rectangle, used, int(fetches_of(on_host(recorder.counts)).sum()))
 
     def _record(self, job: tuple[_Tile, bool]) -> None:
         tile, keep = job
-        zeros, device = self.counter.zeros, self.prepared.device
-        first = np.cumsum(tile.used, dtype=np.int64) - tile.used
-        n = int(tile.used.sum(dtype=np.int64))
-
-        def run(film: int, recorder: Recorder) -> ray_log.RayLog:
-            recorder.counts = zeros(n, Counts)
-            log = ray_log.RayLog()
-            log.used = zeros(len(tile.used), wp.int32)
-            log.first, log.rays = upload(first, wp.int64, device), zeros(n, ray_log.LoggedRay)
-            self.counter.trace(tile.rectangle, self.films[film], recorder, log)
-            return log
-
-        recorder = Recorder()
-        tile.rays = run(1, recorder).rays.numpy().copy()
-        tile.counts = recorder.counts.numpy().copy()
-        length = tile.counts["nodes"].astype(np.int64) + tile.counts["primitives"]
-        at = np.concatenate([[0], np.cumsum(length)])
-        recorder = Recorder()
-        recorder.first, recorder.fetches = upload(at, wp.int64, device), zeros(int(at[-1]), wp.int64)
-        run(2, recorder)
-        trace = recorder.fetches.numpy()
-        tile.lines = distinct_lines(at, trace // int(SIZE_RANGE), trace % int(SIZE_RANGE))
+        recorder, log = self._trace(tile.rectangle, 1, tile.used)
+        tile.rays, tile.counts = log.rays.numpy().copy(), recorder.counts.numpy().copy()
+        first = np.concatenate([[0], np.cumsum(fetches_of(tile.counts))])
+        trace = self._trace(tile.rectangle, 2, tile.used, first)[0].fetches.numpy()
+        tile.lines = distinct_lines(first, trace // int(SIZE_RANGE), trace % int(SIZE_RANGE))
         tile.trace = trace.copy() if keep else None
-        self._report(tile.rectangle, 2, n)
+        self._report(tile.rectangle, 2, len(tile.rays))
+
+    def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
+        """Report to `progress` that a tile has finished `runs` more passes. rays: number of rays of one pass."""
+        progress, spp = self.plan.options.progress, self.plan.scene.settings.spp
+        if progress is not None:
+            with self.lock:
+                self.done += runs * rectangle[2] * rectangle[3] * spp
+                self.rays += runs * rays
+                progress(Progress(self.done, 3 * self.plan.area * spp, self.rays, time.perf_counter() - self.begin))
 
     def _gather(self, tiles: list[_Tile]) -> Rays:
         rays = np.concatenate([tile.rays for tile in tiles])
@@ -270,7 +288,12 @@ class Profiler:
         depth = (label[path] - 1) // int(BRANCHES)
         trace = [tile.trace for tile in tiles if tile.trace is not None]
         kept = np.concatenate([np.full(len(tile.rays), tile.trace is not None) for tile in tiles])
-        length = counts["nodes"][kept].astype(np.int64) + counts["primitives"][kept]
+        length = fetches_of(counts[kept])
         fetches = np.concatenate(trace) if trace else np.zeros(0, np.int64)
         return Rays(rays, counts, pixel, kind, depth, np.concatenate([tile.lines for tile in tiles]), np.flatnonzero(kept),
                     np.concatenate([[0], np.cumsum(length)]), fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
+
+
+def fetches_of(counts: np.ndarray) -> np.ndarray:
+    """Return the number of fetches of each ray, (N,) int64. counts: (N,) kernels.traverse.observer.Counts."""
+    return counts["nodes"].astype(np.int64) + counts["primitives"]

@@ -10,8 +10,7 @@ import pytest
 import wrt
 from tests.refused import refused
 from tests.rewalk import REWALK, rays
-from wrt.lab.costs import COUNTERS
-from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
+from wrt.lab.rtcore.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
 from wrt.renderer.options import Progress
 from wrt.scene.model import Scene
 from wrt.scene.shapes import box
