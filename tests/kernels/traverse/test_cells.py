@@ -9,18 +9,42 @@ from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 from tests.cell_cases import assert_rays_at_corners_agree, assert_same, grazing, soup
 from tests.rewalk import PRIMITIVES
 from wrt.accel.scenes.build import build
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 
+def corner_planes(grid):
+    """Return the coordinates of the planes between cells, one array for each axis."""
+    layout = grid.data
+    return [np.append(np.float32(layout.lo[a]) + np.arange(layout.n[a], dtype=np.float32) * np.float32(layout.size[a]),
+                      np.float32(layout.hi[a])) for a in range(3)]
+
+
 @pytest.mark.parametrize("mailbox", [True, False])
-def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
+@pytest.mark.parametrize("name", ["grid", "octree"])
+def test_rays_in_faces_and_through_edges_and_corners_of_cells(name, mailbox):
     rng = np.random.default_rng(1)
     geometry = soup(rng)
-    octree = build(geometry, "octree", mailbox=mailbox)
-    lo, hi = np.array(octree.data.lo, np.float32), np.array(octree.data.hi, np.float32)
-    size = np.float32(octree.data.size) * np.float32(1 << int(octree.data.levels) - 4)
-    corner = np.minimum(lo + rng.integers(0, 17, (20_000, 3)).astype(np.float32) * size, hi)
-    assert_rays_at_corners_agree(octree, geometry, corner, size, rng)
+    accel = build(geometry, name, mailbox=mailbox)
+    if name == "grid":
+        size, corner = np.array(accel.data.size), np.stack([rng.choice(plane, 20_000) for plane in corner_planes(accel)], axis=1)
+    else:
+        lo, hi = np.array(accel.data.lo, np.float32), np.array(accel.data.hi, np.float32)
+        size = np.float32(accel.data.size) * np.float32(1 << int(accel.data.levels) - 4)
+        corner = np.minimum(lo + rng.integers(0, 17, (20_000, 3)).astype(np.float32) * size, hi)
+    assert_rays_at_corners_agree(accel, geometry, corner, size, rng)
+
+
+def test_a_hit_in_a_later_cell_does_not_end_the_walk():
+    # A long triangle begins in the first cell and is hit in the last cell. A short triangle between them is nearer.
+    long = [[-1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [9.0, 0.0, 9.0]]
+    short = [[6.0, -1.0, 5.0], [6.0, 1.0, 5.0], [6.0, 0.0, 9.0]]
+    rest = [[[x, 20.0, z], [x + 1.0, 20.0, z], [x, 20.0, z + 1.0]] for x in range(9) for z in range(9)]
+    vertices = np.array([long, short, *rest]).reshape(-1, 3)
+    mesh = Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    grid = build(mesh, "grid", density=50.0)
+    hits = grid.closest_hit([[-1.0, 0.0, 7.0]], [[1.0, 0.0, 0.0]], counters=True)
+    assert hits.prim_id[0] == 1 and hits.t[0] == 7.0
 
 
 def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
@@ -58,16 +82,27 @@ def cells(octree):
     return begin + step * low, begin + step * (low + size[:, None])
 
 
-def test_mailboxing_saves_tests_and_no_cells():
+@pytest.mark.parametrize("name", ["grid", "octree"])
+def test_mailboxing_saves_tests_and_no_cells(name):
     rng = np.random.default_rng(4)
     geometry = soup(rng, 300, 0.6)
     origin = rounded(4.0 * unit(rng.normal(size=(2000, 3))))
     direction = rounded(rng.uniform(-0.5, 0.5, (2000, 3)) - origin)
-    with_it, without = (build(geometry, "octree", mailbox=m).closest_hit(origin, direction, counters=True) for m in (True, False))
+    with_it, without = (build(geometry, name, mailbox=m).closest_hit(origin, direction, counters=True) for m in (True, False))
     assert_same(with_it, without)
     assert np.array_equal(with_it.counters.nodes, without.counters.nodes)
     assert (with_it.counters.primitives <= without.counters.primitives).all()
     assert with_it.counters.primitives.sum() < 0.95 * without.counters.primitives.sum()
+
+
+def test_the_walk_of_a_grid_ends_at_the_hit_and_at_t_max():
+    ball = build(icosphere(4), "grid")
+    outside = ball.closest_hit([[-5.0, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    through = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], counters=True).counters
+    n = ball.data.n[0]
+    assert outside.nodes[0] <= 3 and n / 2 < through.nodes[0] <= n
+    near = ball.closest_hit([[-0.5, 0.01, 0.02]], [[1.0, 0.0, 0.0]], 0.0, 0.001, counters=True).counters
+    assert near.nodes[0] <= 2
 
 
 def test_the_walk_ends_at_the_hit_and_at_t_max_and_passes_over_empty_space():
