@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from docs.site.scene_format import EXAMPLE
 from tests.command_line import BOX_OBJ
 from tests.gltf_files import one_triangle, rich_file
 from wrt.picture.image import encode_png, write_exr, write_image
@@ -40,34 +41,14 @@ def side_files(folder: Path) -> None:
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 SCENE = """\
-title = "everything"
+title = "what needs other files"
 ambient = 0.1
 include = ["thing.glb", {file = "thing.gltf", transform = {translate = [0, 1, 0], axis = [0, 1, 0], angle = 30}}]
 
-[settings]
-size = [64, 36]
-spp = 4
-max_depth = 3
-filter = "gaussian"
-glass_shadows = "tinted"
-exposure = -0.5
-tonemap = "aces"
-
-[cameras.main]
-position = [0, 1, 4]
-target = [0, 0.5, 0]
-fov_y = 40
-aperture_radius = 0.05
-focus_distance = 4.1
-blades = 6
-blade_rotation = 10
-
 [cameras.lens]
 matrix = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5, 0, 0, 0, 1]
-focal_length = 0.05
-sensor_height = 0.024
-f_number = 2.8
-focus_distance = 3
+aperture_radius = 0.05
+blades = 6
 
 [background]
 type = "environment"
@@ -77,7 +58,6 @@ scale = 0.5
 
 [materials]
 floor = {albedo = 0.5, albedo_texture = {checkerboard = {color_a = 0.8, color_b = [0.1, 0.2, 0.3], scale = 2}}}
-glass = {kind = "glass", ior = 1.5, absorption = [0.1, 0.2, 0.3], roughness = 0.1}
 metal = {kind = "conductor", metal = "gold", roughness = 0.2}
 leaf = {albedo_texture = {file = "a.png", wrap = "clamp", scale = 2, rotation = 20, offset = [-0.1, 0.2]}, alpha_mode = "mask"}
 rough = {kind = "metallic_roughness", metallic_roughness_texture = {file = "a.png"}, normal_texture = {file = "a.png"}}
@@ -85,23 +65,6 @@ lamp = {albedo = 0, emission = 5, two_sided = true, alpha = 0.5, alpha_mode = "b
 
 [override]
 "material 0" = {kind = "mirror", albedo = 0.9}
-
-[[spheres]]
-center = [0, 1, 0]
-radius = 0.5
-material = "glass"
-
-[[quads]]
-corner = [-5, 0, 5]
-edge_u = [10, 0, 0]
-edge_v = [0, 0, -10]
-material = "floor"
-
-[[boxes]]
-low = [-1, 0, -1]
-high = [-0.5, 0.5, -0.5]
-material = "metal"
-transform = {rotate = [0, 30, 0], scale = 2}
 
 [[meshes]]
 file = "box.obj"
@@ -135,27 +98,11 @@ direction = [0, -1, 0]
 intensity = [5, 5, 4]
 inner = 10
 outer = 20
-
-[[lights]]
-type = "rectangle"
-corner = [0, 3, 0]
-edge_u = [1, 0, 0]
-edge_v = [0, 0, 1]
-radiance = 2
-"""
-SMALL_SCENE = """\
-background = {type = "gradient", bottom = [1, 1, 1], top = 0.5}
-materials.red = {albedo = [0.8, 0.1, 0.1], specular = 0.2, exponent = 20}
-spheres = [{center = [0, 0, -3], radius = 1, material = "red"}]
-meshes = [{shape = {kind = "icosphere", subdivisions = 1}, material = "red"},
-          {shape = {kind = "torus", segments = 6, tube_segments = 5}, material = "red"},
-          {shape = {kind = "teapot", segments = 5}, material = "red"}, {shape = {kind = "prism", sides = 5}, material = "red"}]
-lights = [{type = "point", position = [0, 3, 0], intensity = 9}, {type = "directional", direction = [0, -1, 0.5], irradiance = 1}]
 """
 
 
 def scenes() -> list[Seed]:
-    return [Seed(".toml", SCENE.encode()), Seed(".toml", SMALL_SCENE.encode())]
+    return [Seed(".toml", SCENE.encode()), Seed(".toml", EXAMPLE.encode())]
 
 
 @cache

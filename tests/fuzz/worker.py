@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import mmap
 import os
 import random
 import resource
+import signal
 import sys
 import time
 import traceback
@@ -24,6 +24,7 @@ from tests.fuzz.formats import ALL_FORMATS, Format, make_case
 from wrt.core.errors import InputError, SceneWarning
 
 ROOM = 1 << 30  # bytes of address space that a worker may allocate for the inputs
+HANG, STUCK = 40.0, 60.0  # longest processor time of an input, and longest time: the system then ends the worker
 
 
 class Judge:
@@ -99,9 +100,8 @@ def _place(error: BaseException) -> str:
 def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
     judge = Judge(ALL_FORMATS[name], Path(folder))
     out = os.fdopen(os.dup(1), "w")
-    beat_path = Path(folder) / "beat"
-    beat_path.write_bytes(b"\0" * 8)
-    with open(beat_path, "r+b") as file, mmap.mmap(file.fileno(), 8) as beat, judge.watching_stderr():
+    beat = os.open(Path(folder) / "beat", os.O_WRONLY | os.O_CREAT)
+    with judge.watching_stderr():
         for each in judge.form.seeds():  # so that imports, kernels and caches are in memory before the limit is set
             judge.read(-1, each)
         judge.outcomes = dict.fromkeys(judge.outcomes, 0)
@@ -110,7 +110,9 @@ def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
         begin = time.perf_counter()
         for number in range(int(first), int(first) + int(count)):
-            beat[:] = (number + 1).to_bytes(8, "little")
+            os.pwrite(beat, (number + 1).to_bytes(8, "little"), 0)
+            signal.setitimer(signal.ITIMER_PROF, HANG)
+            signal.setitimer(signal.ITIMER_REAL, STUCK)
             case = make_case(judge.form, random.Random(f"{seed} {name} {number}"))
             if problem := judge.read(number, case):
                 print(json.dumps({"number": number, "problem": problem, "suffix": case.suffix}), file=out, flush=True)

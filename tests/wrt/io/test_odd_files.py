@@ -12,7 +12,6 @@ import pytest
 from tests.command_line import Result, wrt
 from tests.data import DATA, data_path
 from wrt.io.load import load_scene
-from wrt.io.mesh_file import load_mesh
 from wrt.picture.image import read_image
 
 ODD = DATA / "odd"
@@ -66,26 +65,6 @@ def test_no_triangle_is_lost_on_the_way(name: str) -> None:
     result = wrt("info", odd(name), "--json")
     facts = json.loads(result.out)
     assert (facts["triangles"], facts["zero_area_triangles_left_out"]) == TRIANGLES[name]
-
-
-def test_the_wall_with_a_hole_keeps_its_area() -> None:
-    """The fans of its polygons have 66 triangles, 11 without area; other triangulations may have fewer without area. Some
-    polygons are concave: their area is the length of the vector sum over the fan, not the sum of the triangles' areas."""
-    path = odd("wallhole.obj")
-    mesh = load_mesh(path)
-    assert len(mesh.faces) + mesh.dropped == 66 and mesh.dropped <= 11
-    positions = np.array([[float(x) for x in line.split()[1:4]] for line in text_lines(path) if line.startswith("v ")])
-    faces = [[int(corner.split("/")[0]) - 1 for corner in line.split()[1:]] for line in text_lines(path) if line[:2] == "f "]
-    fans = [np.cross(*(positions[[f[1:-1], f[2:]]] - positions[f[0]])) / 2 for f in faces]
-    assert sum(map(len, fans)) == 66 and sum((fan == 0).all(axis=1).sum() for fan in fans) == 11
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    cut = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    areas = [np.linalg.norm(fan.sum(axis=0)) for fan in fans]
-    assert np.linalg.norm(cut, axis=1).sum() == pytest.approx(sum(areas))
-
-
-def text_lines(path: Path) -> list[str]:
-    return path.read_text().replace("\\\n", " ").splitlines()
 
 
 @pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 import struct
@@ -314,13 +313,6 @@ def test_texture_transform_examples_of_the_specification(tmp_path):
         np.array([[0, 1], [1, 1], [1, 0], [0, 0]]))
 
 
-def test_texture_transform_scales_before_it_turns_and_shifts(tmp_path):
-    matrix = uv_transform(tmp_path, offset=[0.1, 0.2], rotation=0.3, scale=[2, 3])
-    c, s = math.cos(0.3), math.sin(0.3)
-    assert matrix @ [0.5, 0.25, 1] == pytest.approx([c * 1.0 + s * 0.75 + 0.1, -s * 1.0 + c * 0.75 + 0.2])
-    assert np.array_equal(uv_transform(tmp_path), np.eye(2, 3))
-
-
 def test_second_set_of_coordinates_is_left_out_and_named(tmp_path):
     for info in ({"texCoord": 1}, {"extensions": {"KHR_texture_transform": {"texCoord": 1}}}):
         path = textured({"name": "m", **base(**info)}).write(tmp_path)
@@ -444,15 +436,6 @@ def test_an_unsound_image_is_named(tmp_path):
     file.json["images"] = [{"uri": "../secret.png"}]
     path = file.write(tmp_path)
     assert_named("images[0].uri: '../secret.png': is no path")
-
-
-def test_an_image_in_a_data_uri(tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 255, (3, 5, 4), dtype=np.uint8)
-    file = one_triangle(material=0)
-    file.add("materials", {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}})
-    file.add("textures", {"source": 0})
-    file.add("images", {"uri": "data:image/png;base64," + base64.b64encode(encode(pixels)).decode()})
-    assert np.array_equal(load(file, tmp_path).materials[0].albedo_texture.image, pixels)
 
 
 @pytest.mark.parametrize("mapped", [True, False])
