@@ -139,16 +139,11 @@ def extend(numbers: array[float], words: Sequence[str] | Sequence[bytes]) -> Non
         numbers.extend(map(as_number, words[len(numbers) - before:]))
 
 
-def mesh_of(value: Mesh | PathLike) -> Mesh:
-    """Return a Mesh unchanged, or read the mesh file of a path. Raises InputError for any other value."""
+def as_mesh(value: Mesh | PathLike) -> Mesh:
+    """Return a Mesh unchanged, or read the mesh file of a path. Raises InputError for other values, and for a mesh without triangles."""
     if not isinstance(value, Mesh | str | os.PathLike):
         raise InputError(f"must be a Mesh or the path of a mesh file, got {shown(value)}", argument="mesh")
-    return value if isinstance(value, Mesh) else load_mesh(value)
-
-
-def as_mesh(value: Mesh | PathLike) -> Mesh:
-    """Return `mesh_of(value)`. Also raises InputError if the mesh has no triangles."""
-    mesh = mesh_of(value)
+    mesh = value if isinstance(value, Mesh) else load_mesh(value)
     if not len(mesh.faces):
         raise InputError("the mesh has no triangles", path=None if isinstance(value, Mesh) else value)
     return mesh

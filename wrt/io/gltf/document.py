@@ -69,9 +69,6 @@ class LeftOut:
         self.add(f"{what} outside of [{low:g}, {high:g}]", kind, name)
         return clamped.tolist()
 
-    def __contains__(self, feature: str) -> bool:
-        return feature in self._places
-
     def sentence(self) -> str:
         """Return all features in one line, each with its first five objects; "" without features."""
         return ", ".join(f"{feature} ({', '.join([*places][:5])}{f' and {len(places) - 5} more' * (len(places) > 5)})"

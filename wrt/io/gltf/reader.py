@@ -88,12 +88,9 @@ class _Reader:
                 self._add_camera(node, world, place)
             if not self.shapes_only:
                 self._add_light(node, world, place)
-        for index, animation in enumerate([] if self.shapes_only else document.raw("animations")):
-            name = animation.get("name") if isinstance(animation, dict) else None
-            left_out.add("motion", "animation", name if isinstance(name, str) and name else f"animation {index}")
-        for extension, raw in document.gltf.extensions.items():
-            if extension not in left_out:
-                left_out.add_extensions({extension: raw}, "file", document.path.name)
+        if document.raw("animations") and not self.shapes_only:
+            left_out.add("motion", "file", document.path.name)
+        left_out.add_extensions(document.gltf.extensions, "file", document.path.name)
         scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
         # As in other viewers, light then reaches objects inside of glass.
         solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
@@ -121,9 +118,7 @@ class _Reader:
         left_out, mesh_name = self.document.left_out, source.name or f"mesh {index}"
         for i, primitive in enumerate(source.primitives):
             where = f"meshes[{index}].primitives[{i}]"
-            # A compressed copy of plain accessors has no effect: a file without plain accessors would require the extension.
-            extensions = {k: v for k, v in primitive.extensions.items() if k != "KHR_draco_mesh_compression"}
-            left_out.add_extensions(extensions, "mesh", mesh_name)
+            left_out.add_extensions(primitive.extensions, "mesh", mesh_name)
             posed = skin is not None and {"JOINTS_0", "WEIGHTS_0"} <= set(primitive.attributes)
             if posed < (skin is not None):
                 left_out.add("skins without JOINTS_0 and WEIGHTS_0", "mesh", mesh_name)

@@ -384,7 +384,7 @@ def test_numbers_that_nothing_uses_may_be_nan(tmp_path):
     file.node(translation=[math.nan, 0, 0])
     file.json |= {"scenes": [{"nodes": [0]}], "cameras": [{"type": "perspective", "perspective": {"yfov": math.inf}}]}
     scene, messages = load_warned(file.write(tmp_path), staged=False)
-    assert len(scene.objects) == 1 and messages[0].endswith("left out: motion (animation 'animation 0')")
+    assert len(scene.objects) == 1 and messages[0].endswith("left out: motion (file 'file.glb')")
 
 
 def test_shapes_need_no_cameras_and_no_extensions_of_materials(tmp_path):

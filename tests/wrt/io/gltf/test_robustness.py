@@ -34,8 +34,8 @@ def test_one_warning_names_everything_once(tmp_path):
                   "extensions": {"KHR_materials_variants": {"variants": []}, "ACME_fog": {}, "KHR_xmp": {}}}
     scene, messages = load_warned(file.write(tmp_path), staged=False)
     assert len(scene.objects) == 2 and len(messages) == 1
-    things = ["ACME_wind (node 'place')", "KHR_materials_variants (mesh 'thing')",
-              "skins without JOINTS_0 and WEIGHTS_0 (mesh 'thing')", "COLOR_0 (mesh 'thing')", "motion (animation 'walk')",
+    things = ["ACME_wind (node 'place')", "KHR_materials_variants (mesh 'thing', file 'file.glb')",
+              "skins without JOINTS_0 and WEIGHTS_0 (mesh 'thing')", "COLOR_0 (mesh 'thing')", "motion (file 'file.glb')",
               "ACME_fog (file 'file.glb')"]
     assert messages[0].endswith("not supported and left out: " + ", ".join(things))
 
