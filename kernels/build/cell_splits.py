@@ -189,7 +189,7 @@ def best_across(work: CellWork, cell: Cell, options: CellOptions, limit: wp.floa
                 below = wp.float64(position) - wp.float64(cell.lo[axis])
                 above = wp.float64(cell.hi[axis]) - wp.float64(position)
                 counts = wp.float64(step) * ((below * rim + caps) * wp.float64(left) + (above * rim + caps) * wp.float64(n - ended))
-                cost = options.cost_axis + scale * counts
+                cost = options.cost_node + scale * counts
                 if left == 0 or ended == n:
                     cost = cost * (wp.float64(1.0) - options.empty_bonus)
                 if cost < best.cost and step * (wp.max(left, 1) + wp.max(n - ended, 1)) <= cell.budget:
@@ -305,7 +305,7 @@ def cheaper(shapes: Shapes, work: CellWork, cell: Cell, options: CellOptions, tr
     below = options.cost_intersection * wp.float64(step) * shares[0]
     above = options.cost_intersection * wp.float64(step) * shares[1]
     least = wp.min(below, above)
-    cost = options.cost_plane + least * wp.float64((cell.count + step - 1) / step)
+    cost = options.cost_node + least * wp.float64((cell.count + step - 1) / step)
     only_low = int(0)
     only_high = int(0)
     for i in range(cell.first, cell.first + cell.count, step):

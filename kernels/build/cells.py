@@ -44,8 +44,7 @@ class CellOptions:
     max_depth: int
     by_cost: int  # Octree: 1: a cell becomes a leaf if its octants do not cost less.
     cost_intersection: wp.float64  # Cost of a primitive.
-    cost_axis: wp.float64  # Cost of a node whose plane is across an axis.
-    cost_plane: wp.float64  # BSP tree: cost of a node with any other plane.
+    cost_node: wp.float64  # Cost of a node.
     empty_bonus: wp.float64  # k-d tree: fraction by which the cost of a split is reduced if one side is empty.
     sampled: int  # Largest number of references whose boxes propose planes across an axis.
     triangles: int  # BSP tree: largest number of triangles that propose other planes.

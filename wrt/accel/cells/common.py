@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from wrt.core.building import tally
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
-from wrt.core.types import Kernel, WarpStruct
+from wrt.core.types import WarpStruct
 from wrt.kernels.build import cells as kernels
 from wrt.kernels.build.cell_splits import RULES
 from wrt.kernels.build.clip import Shapes
@@ -46,12 +46,6 @@ def shapes_of(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], clip: b
     shapes.lo, shapes.hi = (upload(array, wp.vec3, cpu) for array in bounds)
     shapes.exact = upload(exact.astype(np.uint8), wp.uint8, cpu)
     return shapes
-
-
-@cache
-def build_kernel(name: str) -> Kernel:
-    kernel: Kernel = kernels.make_build_cells(RULES[name])
-    return kernel
 
 
 @dataclass
@@ -116,7 +110,8 @@ def launched(name: str, shapes: WarpStruct, references: np.ndarray, cell: np.nda
     out.deferred = wp.empty(8 * budget // options.keep + 64 if options.keep else 0, dtype=kernels.Cell, device=cpu)
     out.records = wp.empty(budget if options.keep else 0, dtype=BuildRecord, device=cpu)
     out.totals = wp.zeros(1, dtype=kernels.CellTotals, device=cpu)
-    launch(build_kernel(name), 1, shapes, upload(references, BuildRecord, cpu), upload(cell, kernels.Cell, cpu), options, work, out)
+    launch(kernels.make_build_cells(RULES[name]), 1, shapes, upload(references, BuildRecord, cpu), upload(cell, kernels.Cell, cpu), options,
+           work, out)
     totals = on_host(out.totals)[0].copy()
     return Subtree(on_host(out.nodes)[: totals["nodes"]].copy(), out.order.numpy()[: totals["references"]].copy(), totals,
                    on_host(out.deferred)[: totals["deferred"]].copy(), on_host(out.records)[: totals["records"]].copy())

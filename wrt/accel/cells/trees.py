@@ -63,7 +63,7 @@ class KdTree(OneMesh):
         bounds, n = bounds_of(self.geometry), len(self.geometry)
         chosen = CellOptions()
         chosen.max_leaf, chosen.max_depth = options.max_leaf, options.depth(n)
-        chosen.cost_axis, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
+        chosen.cost_node, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
         chosen.empty_bonus, chosen.sampled = options.empty_bonus, KD_SAMPLED
         tree = build_tree("kdtree", shapes_of(self.geometry, bounds, options.clip), root_of(bounds, options.max_growth, 64), chosen,
                           self.threads)
@@ -113,7 +113,7 @@ class Bsp(OneMesh):
             raise InputError(f"bsp is slow to build, so that max_triangles={options.max_triangles} is the limit; there are {n}",
                              argument="max_triangles", hint="use another structure (kdtree, bvh), or raise max_triangles")
         bounds, chosen = bounds_of(self.geometry), CellOptions()
-        chosen.cost_intersection, chosen.cost_axis, chosen.cost_plane = options.cost_intersection, 1.0, 1.0
+        chosen.cost_intersection, chosen.cost_node = options.cost_intersection, 1.0
         chosen.sampled, chosen.triangles = SAMPLED, options.samples
         chosen.max_depth = options.max_depth or min(MAX_BSP_DEPTH, 16 + 2 * math.ceil(math.log2(max(n, 1))))
         tree = build_tree("bsp", shapes_of(self.geometry, bounds), root_of(bounds, options.max_growth), chosen, self.threads)
