@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.data import data_path
 from tests.kernel_tools import machine_code, rounded
 from tests.rewalk import PRIMITIVE_BYTES, PRIMITIVES, REWALK, prim_ids, rays
 from tests.structures import STRUCTURES, families_first
@@ -15,7 +14,6 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.snapshot import Structure
 from wrt.accel.structures import ACCELERATORS
-from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import make_closest_hit_kernel
 from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2
@@ -88,14 +86,6 @@ def test_counters_are_those_of_some_walk(name):
     assert 50 < len(hit) < 450
     assert ((counters.pops > 0) <= (counters.pushes > 0)).all() and (counters.stack <= counters.pushes).all()
     assert name == "brute_force" or counters.primitives.mean() < 0.4 * len(structure.geometry)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in REWALK if name != "brute_force"])
-@pytest.mark.parametrize("mesh", ["cow.obj", "suzanne.obj", "teapot.obj", "rocker-arm.obj", "legocar.obj"])
-def test_counters_equal_a_walk_on_real_meshes(name, mesh):
-    folder = "medium" if mesh == "rocker-arm.obj" else "small"
-    check(Geometry.of(load_mesh(data_path(f"meshes/{folder}/{mesh}"))), name, 10_000, 3)
 
 
 @pytest.mark.parametrize("name", STRUCTURES)

@@ -10,8 +10,7 @@ import pytest
 
 import wrt
 from tests import device
-from tests.data import data_path
-from tests.structures import STRUCTURES, families_first
+from tests.structures import families_first
 from wrt.accel.queries.observed import RecordedSteps, record_steps
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.steps import Entry, Region
@@ -81,12 +80,6 @@ def test_a_gpu_records_the_steps_of_the_cpu(name: str) -> None:
     rays = aimed(icosphere(2), 200, 0)
     steps = [record_steps(wrt.build(icosphere(2), name, device=where), *rays).steps for where in ("cpu", device.NAME)]
     assert steps[0].tobytes() == steps[1].tobytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in STRUCTURES if name != "brute_force"])
-def test_the_steps_of_ten_thousand_rays_give_the_counters(name: str) -> None:
-    check_counts(wrt.load_mesh(data_path("meshes/small/suzanne.obj")), name, 10_000)
 
 
 @pytest.mark.parametrize("name", families_first())

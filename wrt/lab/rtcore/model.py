@@ -4,7 +4,7 @@ An RT core tests boxes and triangles at fixed rates, reads nodes and triangles t
 Each of these limits is a term, in clocks per ray. The terms overlap in time, so the largest term decides, as in a roofline model. NVIDIA
 has not published Turing's rates. So results are ranges over assumptions; they serve to order variants and to find sensitivities."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -87,13 +87,11 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
     """Return a prediction for each combination of assumed values: the fields `names` of Core take their values in SWEEPS."""
-    return [predict(work, gpu, each) for each in variants(core, names)]
-
-
-def variants(core: Core, names: tuple[str, ...]) -> Iterator[Core]:
+    out = []
     for values in product(*(SWEEPS[name] for name in names)):
         changes: dict[str, Any] = dict(zip(names, values, strict=True))
-        yield replace(core, **changes)
+        out.append(predict(work, gpu, replace(core, **changes)))
+    return out
 
 
 def span(predictions: list[Prediction]) -> tuple[float, float]:
