@@ -1,4 +1,4 @@
-"""Read the metadata that wrt writes to picture files with independent readers: Pillow, OpenImageIO, and a parser of HDR headers."""
+"""Read the metadata that wrt writes to picture files with independent readers: Pillow and OpenImageIO."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     if suffix == ".png":
         with Image.open(path) as picture:
             pairs = [(key, str(value)) for key, value in picture.info.items()]
-    elif suffix == ".hdr":
-        lines = Path(path).read_bytes().split(b"\n\n", 1)[0].decode(errors="replace").splitlines()
-        pairs = [(key, value) for key, _, value in (line.removeprefix("# ").partition("=") for line in lines)]
     else:
         source = oiio.ImageInput.open(str(path))
         pairs = [(entry.name, str(entry.value)) for entry in source.spec().extra_attribs]

@@ -352,12 +352,6 @@ def _share_hashes() -> None:
     context.ModuleHasher.hash_function = hash_function
 
 
-def processor_features() -> frozenset[str]:
-    """Return LLVM's names of this processor's instruction sets, for example "avx2"; empty if Warp cannot compile for the CPU."""
-    llvm = context.runtime.llvm
-    return frozenset() if llvm is None else frozenset(llvm.wp_get_host_cpu_features().decode().split(","))
-
-
 def _headers_key(options: dict[str, Any]) -> str:
     """Return a name for headers precompiled with these options.
 

@@ -70,7 +70,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     """Write one picture in the format of the suffix.
 
     - pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half).
-    - exposure, tonemap: for PNG, JPEG and WebP alone; metadata: text entries, written as `wrt:key`.
+    - exposure, tonemap: for PNG, JPEG and WebP alone; metadata: text entries, written as `wrt:key`; HDR has none.
 
     EXR keeps NaN and infinite values. In PNG, JPEG and WebP, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative
     values, and its largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an
@@ -85,7 +85,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     elif suffix == ".exr":
         write_exr(path, color_channels("", as_half(path, pixels) if bits == 16 else pixels), metadata)
     else:
-        _write_hdr(path, pixels, metadata or {})
+        _write_hdr(path, pixels)
 
 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Metadata | None = None) -> None:
@@ -139,8 +139,8 @@ def _oiio() -> Any:
     return OpenImageIO
 
 
-def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b"") -> None:
-    """Write (H, W, C) float32 by OpenImageIO, and insert `header` after the first line of the file."""
+def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray) -> None:
+    """Write (H, W, C) float32 by OpenImageIO."""
     oiio = _oiio()
     with replacing(path) as file:
         out = oiio.ImageOutput.create(Path(path).suffix[1:])
@@ -152,20 +152,14 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
         error = " ".join((oiio if out is None else out).geterror().split()).replace(file.name, os.fspath(path))
         if error or not good:
             raise InputError(f"cannot be written: {error or 'unknown error'}", path=path)
-        if header:
-            file.seek(0)
-            first, rest = file.read().split(b"\n", 1)
-            file.seek(len(first) + 1)
-            file.write(header + rest)
 
 
-def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Metadata) -> None:
+def _write_hdr(path: PathLike, pixels: np.ndarray) -> None:
     oiio = _oiio()
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
     clipped = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
-    header = "".join(f"# {METADATA_PREFIX}{key}={' '.join(str(value).split())}\n" for key, value in metadata.items())
-    _write_oiio(path, spec, clipped, _utf8(header))
+    _write_oiio(path, spec, clipped)
 
 
 def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:

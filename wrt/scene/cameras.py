@@ -121,19 +121,8 @@ class Camera(CameraKind):
 
     `Camera.look_at` places one; `Camera.lens` computes fov_y, aperture_radius and focus_distance from the data of a real lens.
 
-    Parameters
-    ----------
-    camera_to_world
-        (4, 4) rotation and translation; the camera looks along its own -z, +y is up. Scale and shear are dropped.
-    fov_y
-        Full vertical angle of view in radians.
-    aperture_radius, focus_distance
-        Radius of the lens (0: a pinhole), and distance along the axis to the plane in focus, in scene units.
-    blades, blade_rotation
-        Number of straight sides of the aperture, 3 or more (0: round), and its rotation in radians.
-    least_fov_x
-        Least horizontal angle of view in radians. In a picture that is too narrow for it, the vertical angle is larger than fov_y.
-    """
+    camera_to_world is a (4, 4) rotation and translation: the camera looks along its own -z, +y is up; scale and shear are dropped. Angles are
+    in radians, lengths in scene units."""
 
     kind = "perspective"
     device = "wrt.kernels.shade.cameras.perspective"

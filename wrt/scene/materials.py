@@ -104,47 +104,19 @@ CONDUCTORS: dict[str, tuple[Color, Color]] = {
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Optical properties of a surface. Objects share a material if they hold the same instance; equality is identity.
+    """Optical properties of a surface; each field says what it is, and which kinds read it.
 
-    Parameters
-    ----------
-    kind
-        - "diffuse": Lambert with `albedo`, plus a normalised Blinn-Phong highlight of `specular` and `exponent`.
-        - "mirror": reflectance `albedo` at every angle.
-        - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS) and `roughness`.
-        - "glass": dielectric of index `ior`; `albedo` tints transmission. Also reads `absorption`, `thin` and `roughness`.
-        - "metallic_roughness": as in glTF 2.0, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`,
-          `specular_factor`, `specular_color`, `clearcoat` and `clearcoat_roughness`.
-    albedo
-        Reflectance; for glass the transmittance of each surface.
-    absorption
-        Coefficient per scene unit inside glass (Beer-Lambert): the share exp(-absorption d) of the light is left after a distance d.
-    thin
-        True for an infinitely thin pane: light is not bent, and the reflections of both faces are summed.
-    roughness
-        Perceptual roughness of glTF in [0, 1]; the GGX alpha is its square. 0 is a perfect mirror.
-    specular_factor, specular_color
-        Factor on the reflectance of a dielectric at every angle, and on that at normal incidence (KHR_materials_specular).
-    clearcoat, clearcoat_roughness
-        Share of the surface under a clear coat of index 1.5, and the coat's own roughness (KHR_materials_clearcoat).
-    emission, two_sided
-        Emitted radiance, linear; True if both sides emit, and not only the front (corners counter-clockwise).
-    emits_light
-        True: the emission lights other surfaces, unless it has a texture or `alpha_mode` is not "opaque". False: it is only seen.
-    alpha, alpha_mode, alpha_cutoff
-        Opacity. "opaque" ignores it; "mask" ignores hits with alpha < alpha_cutoff; "blend" lets the share 1 - alpha of the light pass.
-    albedo_texture, emission_texture, normal_texture
-        Factor on `albedo`, and its alpha channel on `alpha`; factor on `emission`; tangent-space normal map, scaled by `normal_scale`.
-    metallic_roughness_texture, transmission_texture
-        Factors on `roughness` (green) and `metallic` (blue); factor on `transmission` (red).
-    specular_texture, specular_color_texture, clearcoat_texture, clearcoat_roughness_texture
-        Factors on the parameters of these names: alpha on `specular_factor`, colour, red, green.
+    Objects share a material if they hold the same instance; equality is identity. The kinds are
 
-    Raises
-    ------
-    InputError
-        If a value has the wrong type or is out of range.
-    """
+    - "diffuse": Lambert with `albedo`, plus a normalised Blinn-Phong highlight of `specular` and `exponent`.
+    - "mirror": reflectance `albedo` at every angle.
+    - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS) and `roughness`.
+    - "glass": dielectric of index `ior`; `albedo` tints transmission. Also reads `absorption` (Beer-Lambert), `thin` and `roughness`.
+    - "metallic_roughness": as in glTF 2.0, KHR_materials_specular and KHR_materials_clearcoat.
+
+    A texture multiplies its parameters. `emission` (radiance of the front, whose corners run counter-clockwise, or of both sides) lights
+    other surfaces unless `emits_light` is False, it has a texture, or `alpha_mode` is not "opaque". Raises InputError if a value has the
+    wrong type or is out of range."""
 
     kind: str = "diffuse"
     name: str = ""

@@ -18,38 +18,12 @@ GLASS_SHADOWS = ("opaque", "tinted")
 
 @dataclass(frozen=True)
 class Settings:
-    """Render settings of a scene. Keywords of `render` override them.
+    """Render settings of a scene; each field says what it is. Keywords of `render` override them.
 
-    Parameters
-    ----------
-    size, spp
-        Width and height in pixels; samples per pixel.
-    max_depth
-        Bounces after the first hit; 0 is direct light alone. None: 64 if light passes through a material of the scene, else 8.
-    min_throughput
-        A ray ends if the largest channel of its throughput would fall below this value.
-    clamp
-        Largest radiance of a sample: brighter ones are scaled down, so that single sparks vanish. The picture gets darker by
-        `stats["clamped_share"]`. 0: no limit.
-    filter
-        Pixel filter: "box", "gaussian" or "blackman-harris".
-    fresnel
-        Fresnel term of dielectrics: "exact", or "schlick", which is cheaper and approximate.
-    glass_shadows
-        "opaque": solid glass blocks shadow rays, which is right except for caustics. "tinted": shadow rays pass straight through
-        solid glass and take its colour (the default of scenes from glTF files with solid glass).
-    sampler
-        "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
-    exposure, tonemap
-        Exposure in stops, factors of 2 on radiance; then the curve from linear to display: "none", "reinhard", "aces" or "agx".
-    auto_exposure
-        Add to `exposure` the stops that show the picture's bright parts just below white (wrt.picture.tonemap.auto_exposure).
-
-    Raises
-    ------
-    InputError
-        If a value has the wrong type or is out of range.
-    """
+    `filter` is "box", "gaussian" or "blackman-harris"; `sampler` "sobol" (Owen-scrambled) or "independent", whose noise falls more slowly;
+    `tonemap` "none", "reinhard", "aces" or "agx". `stats["clamped_share"]` says how much light `clamp` took. Solid glass blocks shadow
+    rays, which is right except for caustics, or tints them (`glass_shadows`). `auto_exposure` is wrt.picture.tonemap.auto_exposure.
+    Raises InputError if a value has the wrong type or is out of range."""
 
     size: tuple[int, int] = field(default=(640, 360), metadata=given("size", "width and height", "pixels"))
     spp: int = field(default=64, metadata=given("whole", "samples per pixel", ge=1, le=1 << 24))
