@@ -21,9 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 from wrt.core.settings import VERSION as __version__
 
-if not Path(__file__).is_file():
-    raise ImportError("wrt cannot be imported from a zip file, because it reads files beside its code: unpack or install it")
-
 # Type checkers and editors read these imports. At run time __getattr__ imports each name on first use.
 if TYPE_CHECKING:
     from wrt import compat as compat

@@ -1,6 +1,5 @@
 """Rays in float64 near a mesh in float32, and the points that they hit."""
 
-from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
@@ -73,15 +72,6 @@ def test_only_rays_with_finite_near_origins_and_directions_are_valid():
     finite = np.isfinite(grid).all(axis=1)
     np.testing.assert_array_equal(valid, finite & (np.abs(np.where(finite[:, None], grid, 0.0)) <= 1e37).all(axis=1))
     assert np.isfinite(origins[valid]).all()
-
-
-def test_threads_share_a_kernel():
-    origins, directions = random_rays(50_000, 3)
-    expected = placed(origins, directions)
-    with ThreadPoolExecutor(4) as pool:
-        for found in pool.map(lambda _: placed(origins, directions, threads=2), range(12)):
-            for one, two in zip(found, expected, strict=True):
-                np.testing.assert_array_equal(one, two)
 
 
 def exact_point(corners, origin, direction):

@@ -31,28 +31,6 @@ class Thing:
 
 THINGS = Rows(Thing, 5, 2)
 
-# The C++ of Rows: a copy for each number. Number k of entry i is at the place (first + k) * length + i.
-STORED = """\
-    memcpy(rows.data + 10ll + i, &value.corner.point[0], 4);
-    memcpy(rows.data + 15ll + i, &value.corner.point[1], 4);
-    memcpy(rows.data + 20ll + i, &value.corner.point[2], 4);
-    memcpy(rows.data + 25ll + i, &value.corner.index, 4);
-    memcpy(rows.data + 30ll + i, &value.key, 4);
-    memcpy(rows.data + 35ll + i, &value.size, 4);
-    memcpy(rows.data + 40ll + i, &value.at[0], 4);
-    memcpy(rows.data + 45ll + i, &value.at[1], 4);
-"""
-
-
-def test_the_text_of_a_store_and_of_a_load() -> None:
-    assert THINGS.store().native_snippet == STORED
-    lines = [line for line in STORED.splitlines(keepends=True) if ".corner.point" not in line and ".at[" not in line]
-    assert THINGS.store("corner.point", "at").native_snippet == "".join(lines)
-    assert Rows(wp.vec3, 4).text("memcpy(&{number}, {place}, 4);") == (
-        "    memcpy(&value[0], rows.data + 0ll + i, 4);\n    memcpy(&value[1], rows.data + 4ll + i, 4);\n"
-        "    memcpy(&value[2], rows.data + 8ll + i, 4);\n")
-
-
 def test_rows_follow_one_another() -> None:
     assert (THINGS.first, THINGS.end) == (2, 10)
     assert (THINGS.field("key").first, THINGS.field("key").end) == (6, 7)

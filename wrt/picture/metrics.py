@@ -7,6 +7,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
+from wrt.picture.heatmap import heatmap, top_of
 from wrt.picture.tonemap import encode_srgb, tone_map
 
 RELMSE_EPS = 0.01
@@ -150,28 +151,19 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
 
 # --- difference image -------------------------------------------------------------------------------------------------
 
-# Colours for differences from 0 to the limit of the colour scale.
-BRIGHTER = np.array([[0, 0, 0], [220, 40, 20], [255, 210, 60], [255, 255, 255]], dtype=np.float64)
-DARKER = np.array([[0, 0, 0], [30, 70, 230], [70, 220, 255], [255, 255, 255]], dtype=np.float64)
-NONFINITE_COLOR = (0, 200, 0)
-BAR_HEIGHT = 24
-
 
 def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Draw the signed difference a - b, with a colour scale below the picture.
-
-    Each pixel shows the linear difference of the channel that differs most. Black: a and b are equal. Red, yellow, white: a is brighter,
-    by more and more. Blue, cyan, white: a is darker. White begins at the 99.9th percentile of |a - b|. Green: a and b differ and are not
-    both finite.
+    """Draw the linear difference |a - b| of the channel that differs most as a heat map with its scale, (H, W, 3) uint8.
 
     Parameters
     ----------
     a, b
-        Picture and reference, (H, W, 3) linear.
+        Picture and reference, (H, W, 3) linear. Where they differ and are not both finite, the picture has the last colour.
 
     Returns
     -------
-    (H + 24, W, 3) uint8
+    (H, W, 3) uint8
+        See `heatmap`: also larger than the pictures.
 
     Raises
     ------
@@ -180,37 +172,6 @@ def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """
     a, b = _pair(a, b)
     with np.errstate(invalid="ignore"):  # inf - inf
-        difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), a - b)
-    finite = np.isfinite(difference).all(axis=-1)
-    difference[~finite] = 0.0
-    signed = np.take_along_axis(difference, np.abs(difference).argmax(axis=-1)[..., None], axis=-1)[..., 0]
-    sizes = np.abs(signed[finite])
-    scale = float(np.quantile(sizes, 0.999) or sizes.max() or 1.0) if sizes.size else 1.0
-    picture = np.concatenate([_heat(signed / scale), _bar(signed.shape[1], scale)])
-    picture[: len(signed)][~finite] = NONFINITE_COLOR
-    return picture
-
-
-def _heat(share: np.ndarray) -> np.ndarray:
-    """Return colours, (..., 3) uint8, of differences as shares of the colour scale's limit, clipped to [-1, 1]."""
-    steps = np.linspace(0.0, 1.0, len(BRIGHTER))
-    size = np.clip(np.abs(share), 0.0, 1.0)
-    colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i])) for i in range(3)]
-    return np.rint(np.stack(colors, axis=-1)).astype(np.uint8)
-
-
-def _bar(width: int, limit: float) -> np.ndarray:
-    """Return the colour scale from -limit to limit, (BAR_HEIGHT, width, 3) uint8, with numbers below it if they fit."""
-    with needed_by("a difference image"):
-        from PIL import Image, ImageDraw
-
-    colors = np.zeros((BAR_HEIGHT, width, 3), np.uint8)
-    colors[: BAR_HEIGHT // 2] = _heat(np.linspace(-1.0, 1.0, width))[None]
-    image = Image.fromarray(colors)
-    draw = ImageDraw.Draw(image)
-    labels = (f"{-limit:.3g}", "a - b", f"{limit:+.3g}")
-    widths = [draw.textlength(label) for label in labels]
-    if sum(widths) + 8 <= width:
-        for label, left in zip(labels, (1.0, 0.5 * (width - widths[1]), width - widths[2] - 1.0), strict=True):
-            draw.text((left, BAR_HEIGHT // 2), label, fill=(230, 230, 230))
-    return np.asarray(image)
+        difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), np.abs(a - b)).max(axis=-1)
+    top = top_of(difference[np.isfinite(difference)])
+    return heatmap(np.nan_to_num(difference, nan=top, posinf=top), "difference |a - b|", top)

@@ -121,8 +121,8 @@ class Camera(CameraKind):
 
     `Camera.look_at` places one; `Camera.lens` computes fov_y, aperture_radius and focus_distance from the data of a real lens.
 
-    camera_to_world is a (4, 4) rotation and translation: the camera looks along its own -z, +y is up; scale and shear are dropped. Angles are
-    in radians, lengths in scene units."""
+    camera_to_world is a (4, 4) rotation and translation: the camera looks along its own -z, +y is up; scale and shear are dropped.
+    Angles are in radians, lengths in scene units."""
 
     kind = "perspective"
     device = "wrt.kernels.shade.cameras.perspective"

@@ -43,19 +43,6 @@ def test_subtrees_are_reported_while_they_are_built() -> None:
     assert len(seen) > 4 and seen == sorted(seen)
 
 
-def test_a_build_reports_to_its_own_caller_only() -> None:
-    inner: list[float] = []
-
-    def nested(done: float) -> None:
-        if not inner:
-            wrt.build(icosphere(1), "grid", progress=inner.append)
-
-    wrt.build(icosphere(3), "octree", progress=nested)
-    assert inner == [0.0, 1.0]
-    wrt.build(icosphere(3), "octree")
-    assert inner == [0.0, 1.0]
-
-
 def test_what_cannot_be_called_is_refused_and_an_error_ends_the_build() -> None:
     with refused("progress", "function of one number"):
         wrt.build(icosphere(1), progress="bar")  # type: ignore[call-overload]

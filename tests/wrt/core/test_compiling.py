@@ -5,7 +5,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -120,12 +119,3 @@ def test_the_log_level_of_a_user_stays(before: str, after: str):
     done = run("-c", f"import warp as wp; wp.config.log_level = wp.{before}\nimport wrt.core.device\n"
                      f"assert wp.config.log_level == wp.{after}")
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_in_a_zip_file_the_import_says_what_to_do(tmp_path: Path):
-    archive = tmp_path / "wrt.zip"
-    with zipfile.ZipFile(archive, "w") as zipped:
-        for path in ("wrt/__init__.py", "wrt/core/__init__.py", "wrt/core/settings.py"):
-            zipped.write(ROOT / path, path)
-    done = run("-c", "import wrt", path=archive, cwd=tmp_path)
-    assert done.returncode == 1 and done.stderr.splitlines()[-1].startswith("ImportError: wrt cannot be imported from a zip file")

@@ -72,9 +72,3 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_message(environment: dict[str
                           env={**without, "PYTHONPATH": str(ROOT), **environment})
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done
     assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("; set WARP_CACHE_PATH to another folder\n")
-
-
-def test_more_rows_than_an_index_reaches_are_refused() -> None:
-    rows = np.broadcast_to(np.zeros(3, np.float32), (1 << 31, 3))
-    with refused(what="2147483648 rows"):
-        upload(rows, wp.vec3, "cpu")

@@ -1,7 +1,6 @@
 """Tables of hits and fetches as files: every number keeps its bits."""
 
 import csv
-import sys
 
 import numpy as np
 import pytest
@@ -61,16 +60,3 @@ def test_a_traces_table_has_its_fetches(tmp_path) -> None:
     assert [int(value) for value in rows["address"]] == trace.address.tolist()
     assert [TESTS.index(name) for name in rows["test"]] == trace.test.tolist()
     assert [int(value) for value in rows["ray"]] == trace.ray.tolist()
-
-
-def test_what_is_refused(tmp_path, monkeypatch) -> None:
-    hits = wrt.build(icosphere(1)).closest_hit([[0.0, 0.0, 3.0]], [[0.0, 0.0, -1.0]])
-    with pytest.raises(wrt.InputError, match=r"must have the suffix \.csv or \.parquet, got \.txt"):
-        hits.save(tmp_path / "hits.txt")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)  # as if it were not installed
-    with pytest.raises(wrt.InputError, match="a Parquet file needs pyarrow") as refused:
-        hits.save(tmp_path / "hits.parquet")
-    assert refused.value.hint == 'pip install "wrt[tables]"'
-    with pytest.raises(wrt.InputError, match="its folder does not exist"):
-        hits.save(tmp_path / "none" / "hits.csv")
-    assert not list(tmp_path.iterdir())

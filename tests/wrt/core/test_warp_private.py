@@ -5,9 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +18,7 @@ from tests.data import ROOT
 from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip
 import warp as wp
 
-from wrt.core import compiling, warp_private
+from wrt.core import warp_private
 from wrt.core.device import preloading, start
 from wrt.core.errors import InputError
 from wrt.core.warp_private import WORKS_WITH
@@ -217,85 +215,6 @@ def test_kernels_of_a_user_are_compiled_as_without_wrt(tmp_path: Path):
         (folder,) = (tmp_path / argument).glob("*/wp___main__*")
         files.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert files[0] == files[1] and {name.rsplit(".", 1)[1] for name in files[0]} == {"cpp", "o", "meta"}
-
-
-def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Warp's compiler precompiles headers that it does not find in its folder."""
-    cache = tmp_path / "cache"
-    cache.mkdir()
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
-    monkeypatch.setattr(warp_private, "_own", lambda: True)
-    without, with_it = tmp_path / "without.cpp", tmp_path / "with.cpp"
-    without.write_text("#define WP_NO_BFLOAT16\n")
-    with_it.write_text("\n")
-    given, precompiled, lock = [], [], threading.Lock()
-
-    def build_cpu(obj_path, cpp_path, extra_flags="", use_precompiled_headers=False, pch_dir=None):
-        with lock:
-            given.append((Path(cpp_path).name, extra_flags, pch_dir))
-        if use_precompiled_headers and pch_dir != "Warp's own" and not any(Path(pch_dir).glob("*.pch")):
-            threading.Event().wait(0.02)
-            (Path(pch_dir) / "made.pch").write_text("headers")
-            precompiled.append(extra_flags)
-        Path(obj_path).write_text("object")
-
-    def a_process(processor: bytes = b"a") -> None:
-        build = a_compiler(build_cpu, processor, monkeypatch)
-        options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": None}
-        with ThreadPoolExecutor(6) as pool:
-            list(pool.map(lambda i: build.build_cpu(str(tmp_path / f"{i}.o"), str((without, with_it)[i % 2]), **options), range(6)))
-        build.build_cpu(str(tmp_path / "out.o"), str(with_it))  # without headers
-
-    a_process()
-    always = "-fpch-instantiate-templates -discard-value-names"
-    flags = {"without.cpp": f"{always} -DWP_NO_BFLOAT16= -O2", "with.cpp": f"{always} -O2"}
-    assert sorted(precompiled) == sorted(flags.values()) and (*("with.cpp", always + " "), None) in given
-    folders = {name: {folder for each, flag, folder in given if each == name and flag == flags[name]} for name in flags}
-    kept = {path for path in cache.iterdir()}
-    assert [len(each) for each in folders.values()] == [1, 1] and {Path(*each) for each in folders.values()} == kept
-    a_process()
-    assert len(precompiled) == 2
-    for _ in range(2):
-        for processor in (b"a", b"b"):  # with one home; Clang refuses the headers of another processor
-            a_process(processor)
-    assert len(precompiled) == 4 and len(set(cache.iterdir()) - kept) == 2
-    shutil.rmtree(cache)  # as for a kernel that is compiled elsewhere
-    given.clear()
-    a_process()
-    assert {folder for _, _, folder in given} == {"Warp's own", None}
-
-
-def a_compiler(build_cpu: Callable, processor: bytes, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """A Warp's `build` whose function is this one, with wrt's changes."""
-    llvm = SimpleNamespace(wp_get_host_cpu_name=lambda: processor, wp_get_host_cpu_features=lambda: b"+avx")
-    runtime = SimpleNamespace(get_clang_pch_dir=lambda: "Warp's own", llvm=llvm)
-    build = SimpleNamespace(build_cpu=build_cpu)
-    monkeypatch.setattr(warp_private, "context", SimpleNamespace(runtime=runtime))
-    monkeypatch.setattr(warp_private, "build", build)
-    warp_private._compile_well()
-    return build
-
-
-def test_headers_of_another_process_that_was_faster_are_not_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The other process uses them: Clang fails if a file is gone that it is about to read."""
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
-    (tmp_path / "cache").mkdir()
-    given: list[Path] = []
-
-    def headers(others: int) -> None:
-        def precompile(folder: Path) -> None:
-            if others:  # as many processes begin and end while this one precompiles
-                headers(others - 1)
-            (folder / "made.pch").write_text("headers")
-
-        monkeypatch.setattr(compiling, "_lock", threading.Lock())
-        given.append(compiling.shared_headers(Path(wp.config.kernel_cache_dir), "key", precompile))
-        inodes.append(given[-1].stat().st_ino)
-
-    inodes: list[int] = []
-    headers(2)
-    assert len(inodes) == 3 and len({*inodes}) == 1 and len({*given}) == 1
-    assert list((tmp_path / "cache").iterdir()) == [given[0]]
 
 
 @kernel

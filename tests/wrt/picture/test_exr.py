@@ -11,7 +11,7 @@ import pytest
 
 from tests.refused import refused
 from wrt.core.errors import SceneWarning
-from wrt.picture.image import EXACT_IN_FLOAT, read_channels, read_image
+from wrt.picture.image import read_channels, read_image
 
 oiio = pytest.importorskip("OpenImageIO")
 
@@ -97,13 +97,6 @@ def test_channels_without_colours_are_refused_and_named(names: str, tmp_path: Pa
     path = save(tmp_path / "a.exr", (specification(pixels, names), pixels))
     with refused(what="must have channels R, G and B, or grey Y; it has " + names.split()[0], path=path):
         read_image(path)
-
-
-def test_whole_numbers_are_kept(tmp_path: Path) -> None:
-    ids = np.array([[[10, 20, 30], [0, 1, EXACT_IN_FLOAT]]], np.uint32)
-    path = save(tmp_path / "a.exr", (specification(ids, kind="uint"), ids))
-    assert np.array_equal(read_image(path), ids)
-    assert np.array_equal(read_channels(path)["B"], ids[..., 2])
 
 
 # --- primaries --------------------------------------------------------------------------------------------------------

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.refused import refused
-from wrt.picture.metrics import BAR_HEIGHT, NONFINITE_COLOR, PIXELS_PER_DEGREE, RELMSE_EPS, compare, difference_image, failures, flip_map
+from wrt.picture.heatmap import MARGIN, TITLE, colors
+from wrt.picture.metrics import PIXELS_PER_DEGREE, RELMSE_EPS, compare, difference_image, failures, flip_map
 from wrt.picture.tonemap import decode_srgb
 
 H, W = 48, 64
@@ -128,39 +129,15 @@ def test_flip_forgives_fine_noise_from_far_away() -> None:
 # --- difference image -------------------------------------------------------------------------------------------------
 
 
-def test_difference_image_tells_sign_and_size() -> None:
-    b = np.full((40, 200, 3), 0.5, dtype=np.float32)
+def test_difference_image_is_a_heat_map_of_the_channel_that_differs_most() -> None:
+    b = np.full((40, 600, 3), 0.5, dtype=np.float32)
     a = b.copy()
-    a[:, 50:100, 1] += 0.1
-    a[:, 100:150, 2] -= 0.1
-    a[:, 150:] -= 0.4
-    picture = difference_image(a, b)
-    assert picture.shape == (40 + BAR_HEIGHT, 200, 3) and picture.dtype == np.uint8
-    equal, brighter, darker, darkest = picture[5, [10, 60, 110, 160]].astype(int)
-    assert equal.max() == 0
-    assert brighter[0] > 2 * brighter[2] and darker[2] > 2 * darker[0]
-    assert darkest.min() == 255
-    assert picture[40, 0].min() == picture[40, -1].min() == 255 and picture[40, 100].max() < 20  # the scale below
-
-
-def test_difference_image_finds_its_own_limit() -> None:
-    b = scene_like()
-    a = b + np.random.default_rng(0).uniform(-1e-4, 1e-4, b.shape).astype(np.float32)
-    a[0, 0] += 100.0
-    picture = difference_image(a, b)[:H]
-    assert picture[0, 0].min() == 255
-    assert 60 < np.median(picture.max(axis=-1))  # one outlier does not turn the rest black
-    assert difference_image(b, b)[:H].max() == 0
-    single = b.copy()
-    single[0, 0] += 0.5
-    assert difference_image(single, b)[0, 0].min() == 255
-
-
-def test_difference_image_marks_what_is_not_finite() -> None:
-    a, b = scene_like(), scene_like()
-    a[2, 2] = np.nan
-    a[4, 4] = b[4, 4] = np.inf
-    b[6, 6] = np.inf
-    picture = difference_image(a, b)
-    assert tuple(picture[2, 2]) == tuple(picture[6, 6]) == NONFINITE_COLOR
-    assert picture[4, 4].max() == 0
+    a[:, 200:400, 1] += 0.1
+    a[:, 400:] -= 0.4
+    a[0, 0], b[0, 1] = np.nan, np.inf
+    a[1, 1] = b[1, 1] = np.nan
+    picture = difference_image(a, b)[TITLE:, MARGIN:]
+    equal, less, most = (picture[5, x] for x in (100, 300, 500))
+    scale = colors().tolist()
+    assert [scale.index(colour.tolist()) for colour in (equal, less, most)] == [0, 51, 204]  # the scale ends at 0.5
+    assert picture[0, 0].tolist() == picture[0, 1].tolist() == scale[-1] and picture[1, 1].tolist() == scale[0]

@@ -173,11 +173,3 @@ def test_corners_of_very_different_size_are_decided_exactly(powers, seed):
     bent = line.copy()
     bent[0, 1] = np.nextafter(bent[0, 1], np.float32(9.0))
     assert has_area(bent, np.array([[0, 1, 2]]))[0] == (len(np.unique(line[1:], axis=0)) == 2 and step[[0, 2]].any())
-
-
-@pytest.mark.parametrize("dtype", [np.uint32, np.uint8, np.int64])
-def test_faces_are_of_any_kind_of_integers(dtype: type) -> None:
-    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)
-    assert clean(corners, np.array([[0, 1, 2]], dtype))[1].tolist() == [[0, 1, 2]]
-    with refused("faces", "3 vertices"):
-        clean(corners, np.array([[0, 1, 3]], dtype))

@@ -114,12 +114,6 @@ def test_tiny_shapes_far_from_their_light_are_lit() -> None:
     assert np.allclose(lit(1e-20), lit(1.0), atol=1e-5) and lit(1.0).max() > 0.3
 
 
-def test_a_single_point_is_rendered_as_nothing() -> None:
-    point = Object(wrt.Mesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32)), (CHALK,))
-    scene = Scene(objects=(point,), background=SKY, cameras=(Camera.look_at((0, 0, 1), (0, 0, 0)),))
-    assert (wrt.render(scene, size=(4, 4), spp=1).pixels == 1.0).all()
-
-
 @pytest.mark.parametrize("scale", [1e-20, 1e-35])
 def test_queries_take_any_size(scale: float) -> None:
     mesh = wrt.Mesh((scale * TRIANGLE).astype(np.float32), np.array([[0, 1, 2]], np.int32))
