@@ -18,7 +18,7 @@ from wrt.io.mesh_file import RawMesh, extend
 # Line breaks may stand between any two words. What is between these statements is not read: loops, normals, colours, comments.
 _STATEMENT = re.compile(rb"""
     \bvertex\s+(\S+)\s+(\S+)\s+(\S+) | \b(facet)\b | \b(end\s*facet)\b | \b(end\s*solid)\b[^\r\n]*
-  | \bsolid\b([^\r\n]*?)(?=\s+facet\b|[\r\n]|\Z) | \#[^\r\n]*""", re.IGNORECASE | re.VERBOSE)
+  | \bsolid\b([^\r\n]*?)(?=\sfacet\b|[\r\n]|\Z) | \#[^\r\n]*""", re.IGNORECASE | re.VERBOSE)
 _LINE_END = re.compile(rb"\r\n?|\n")
 _BLANK = b"\0\t\n\r\x1a "  # what may follow a file's content
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
