@@ -132,10 +132,6 @@ def test_uv_transform_and_several_textures():
     assert table.size == first.image[..., 0].size + turned.image[..., 0].size  # A picture that is used twice is stored once.
 
 
-def test_no_texture_is_white():
-    assert (look_up([Checkerboard()], -1, np.random.default_rng(4).random((9, 2))) == 1.0).all()
-
-
 def test_checkerboard():
     board = Checkerboard((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0)
     uv = np.random.default_rng(5).uniform(-4.0, 4.0, (2000, 2)).astype(np.float32)
@@ -165,13 +161,6 @@ def test_coordinates_beyond_all_integers_keep_their_side():
     assert look_up([Texture(wide, srgb=False, wrap=("clamp", "clamp"))], 0, uv)[:, 0].tolist() == [1.0, 0.0, 1.0, 0.0]
     board = Checkerboard((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0)
     assert look_up([board], 0, [[3e38, 0.5], [3e38, 1.5], [-5e9, 1.5]])[:, 0].tolist() == [1.0, 0.0, 0.0]
-
-
-def test_one_texel_picture():
-    for wrap in ("repeat", "clamp", "mirror"):
-        one = Texture(np.array([[[10, 20, 30, 40]]], np.uint8), srgb=False, wrap=(wrap, wrap))
-        found = look_up([one], 0, np.random.default_rng(6).uniform(-5.0, 5.0, (50, 2)))
-        assert np.allclose(found, np.array([10, 20, 30, 40]) / 255.0, atol=1e-6)
 
 
 def test_the_table_of_plain_numbers_is_a_division():

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from tests.kernel_tools import cpu_only
-from tests.refused import Refusal, refused
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import MAGIC, read
-from wrt.renderer.options import Options, Progress
-from wrt.renderer.render import Renderer, render
+from wrt.renderer.options import Progress
+from wrt.renderer.render import render
 from wrt.renderer.schedule import LocalTracer, Steps
 from wrt.scene.backgrounds import GradientBackground
 from wrt.scene.cameras import Camera
@@ -183,22 +183,6 @@ def test_any_damage_is_noticed(path: Path) -> None:
             read(path)
     path.write_bytes(good + b"\0")
     refuses("is damaged", path, resume=True, size=(8, 6))
-
-
-@pytest.mark.parametrize(("options", "message"), [
-    ({"resume": True}, ("resume", "needs a checkpoint")), ({"checkpoint": "nowhere/a"}, (None, "its folder does", None, "a")),
-], ids=str)
-def test_wrong_options(options: dict[str, Any], message: Refusal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with refused(*message):
-        render(SCENE, **options)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_checkpoint_is_of_one_seed(path: Path) -> None:
-    renderer = Renderer(SCENE, Options(checkpoint=path))
-    with refused(what="seed"):
-        renderer.run(seed=1)
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------

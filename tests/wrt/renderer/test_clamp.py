@@ -84,9 +84,3 @@ def test_a_target_error_and_a_resumed_render_report_the_share(tmp_path: object) 
         rendered(spp=8, clamp=0.8, checkpoint=path, resume=True)  # type: ignore[arg-type]
     resumed, direct = rendered(spp=8, clamp=0.7, checkpoint=path, resume=True), rendered(spp=8, clamp=0.7)  # type: ignore[arg-type]
     assert np.array_equal(resumed.pixels, direct.pixels) and resumed.stats["clamped_share"] == direct.stats["clamped_share"]
-
-
-@pytest.mark.parametrize("limit", [-1.0, float("nan"), float("inf"), "bright"])
-def test_a_wrong_limit_is_refused(limit: float) -> None:
-    with refused("clamp"):
-        rendered(clamp=limit)

@@ -15,7 +15,6 @@ from tests import command_line
 from tests.inspect_all import SCENES, differing_pixels
 from tests.refused import refused
 from wrt.cli.common import json_text
-from wrt.kernels.shade.follow_up import CUT_BY_DEPTH
 from wrt.renderer.inspector.inspect import Inspection, Inspector
 from wrt.renderer.inspector.section import Plane, cut, plane_of
 from wrt.renderer.inspector.tree import Ray
@@ -118,13 +117,6 @@ def test_rays_through_blended_surfaces_go_on() -> None:
                 assert child.direction.tobytes() == ray.direction.tobytes() and child.depth == ray.depth
 
 
-def test_a_depth_of_zero_cuts_every_new_ray() -> None:
-    tree = wrt.inspect(GLASS, (430, 190), 0, max_depth=0)
-    (root,) = [ray for ray in tree.samples[0].rays if ray.children]
-    assert {child.ended for child in root.children} == {"cut by depth"} and CUT_BY_DEPTH != 0
-    assert math.isnan(root.children[0].t)
-
-
 def test_the_text_and_the_json_have_every_ray() -> None:
     tree = inspector().pixel((430, 190), 0)
     rays = tree.samples[0].rays
@@ -146,14 +138,6 @@ def test_the_section_of_a_box_is_a_rectangle() -> None:
     height = 2.0 * 2.0 / 0.6  # it ends at y = -2 and y = 2
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2.0 * (2.0 + height))
     np.testing.assert_allclose(np.abs(lines).max(axis=(0, 1)), (1.0, 0.5 * height))
-
-
-def test_the_section_holds_the_camera_ray() -> None:
-    for pixel in some_pixels():
-        root = pixel.samples[0].rays[0]
-        plane = plane_of(pixel.samples[0], pixel.camera)
-        assert abs(plane.distance(np.array([root.origin, root.end if math.isfinite(root.t) else root.origin]))).max() < 1e-5
-        assert abs(plane.across @ plane.up) < 1e-9 and plane.across @ root.direction > -1e-6
 
 
 def test_the_command_prints_and_draws(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
-from wrt.scene.settings import DEPTH, Settings
+from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, icosphere, quad
 
 SIZE = (37, 22)  # not a multiple of any tile size
@@ -97,20 +97,6 @@ def test_the_seed_changes_the_noise_and_nothing_else(reference: Film) -> None:
         sigma = np.sqrt(a.variance + b.variance)
         z = np.abs(a.pixels - b.pixels)[sigma > 0] / sigma[sigma > 0]
         assert np.median(z) < 1.0  # 0.67 for a normal distribution, less for these stratified samples
-
-
-def test_a_long_render_begins_with_the_samples_of_a_short_one() -> None:
-    """The first samples of a long render are those of a short one: sample 3 is (4 mean_4 - 3 mean_3), in its range."""
-    three, four = (render(SCENE, spp=spp).pixels.astype(np.float64) for spp in (3, 4))
-    last = 4.0 * four - 3.0 * three
-    assert last.min() > -1e-4 and last.max() < 2.0
-
-
-def test_scene_settings_count_and_arguments_override_them() -> None:
-    film = render(SCENE, spp=2, size=(8, 6), exposure=1.5, tonemap="aces")
-    assert film.pixels.shape == (6, 8, 3) and (film.samples == 2).all()
-    assert (film.exposure, film.tonemap) == (1.5, "aces")
-    assert SCENE.settings == Settings(size=SIZE, spp=5, max_depth=DEPTH)
 
 
 # --- what comes back --------------------------------------------------------------------------------------------------
@@ -247,18 +233,6 @@ def test_ctrl_c_does_not_wait_for_the_end_of_a_pass() -> None:
     assert all(np.unique(tile).size == 1 for tile in tiles)
 
 
-def test_ctrl_c_at_the_very_end_is_not_lost() -> None:
-    last: list[Progress] = []
-
-    def at_the_end(progress: Progress) -> None:
-        if progress.done == progress.total:
-            last.append(progress)
-            signal.raise_signal(signal.SIGINT)
-
-    film = render(SCENE, spp=2, progress=at_the_end)
-    assert last and film.stats["interrupted"] and (film.samples == 2).all()
-
-
 def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     may_end, ended = threading.Event(), threading.Event()
 
@@ -380,11 +354,6 @@ def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch
     monkeypatch.setattr("wrt.renderer.render.prepare", lambda *_: pytest.fail("work was done"))
     with refused(what="4096x4096 takes 2.1 GiB"):
         render(SCENE, size=(4096, 4096))
-
-
-def test_a_scene_without_a_camera_is_refused() -> None:
-    with refused(what="scene has no camera", hint="wrt.Camera.look_at"):
-        render(replace(SCENE, cameras=()))
 
 
 def test_a_tree_is_refined_for_many_samples_without_changing_pixels(tmp_path: Path) -> None:

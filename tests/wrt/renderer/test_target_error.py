@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.command_line import wrt as run_command
 from tests.data import ROOT
 from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
@@ -54,14 +53,6 @@ def test_the_render_stops_at_the_first_power_of_two_below_the_target(target: flo
     before = render(SCENE, target_error=target, spp=taken // 2)
     assert before.metadata["spp"] == taken // 2
     assert before.stats["estimated_error"] > target and not before.stats["target_reached"]
-
-
-def test_the_scenes_own_spp_is_no_limit_but_the_callers_is() -> None:
-    scene = SCENE.with_settings(spp=4)
-    assert render(scene, target_error=0.01).metadata["spp"] > 4
-    assert render(scene, target_error=1e-9, spp=30).metadata["spp"] == 30 // GROUPS * GROUPS
-    assert render(scene, target_error=1e-9, spp=1).metadata["spp"] == GROUPS
-    assert MAX_SPP % GROUPS == 0
 
 
 def test_the_picture_is_the_mean_of_independent_ones() -> None:
@@ -115,15 +106,6 @@ def test_time_limit_and_interrupt_end_a_render_with_a_target() -> None:
     film = render(SCENE, target_error=1e-9, progress=stop)
     assert film.stats["interrupted"] and not film.stats["timed_out"] and not film.stats["target_reached"]
     assert np.isfinite(film.pixels).all() and (film.samples % GROUPS == 0).all()
-
-
-def test_the_command_line(tmp_path: Any) -> None:
-    arguments = ("render", ROOT / "scenes" / "whitted.toml", "--size", "32x18", "-o", tmp_path / "a.png")
-    reached = run_command(*arguments, "--target-error", "0.05")
-    assert reached.code == 0 and "estimated error" in reached.err and "above" not in reached.err
-    missed = run_command(*arguments, "--target-error", "1e-9", "--spp", "8")
-    assert missed.code == 0 and "8 spp, estimated error" in missed.err and "above the target of 1e-09" in missed.err
-    assert run_command(*arguments, "--target-error", "0").code == 2
 
 
 # --- whether it is true -----------------------------------------------------------------------------------------------

@@ -22,11 +22,9 @@ from tests.data import ROOT
 from tests.device import NAME
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE, same
-from wrt import profile
 from wrt.io.load import load_scene
 from wrt.picture.film import Film
 from wrt.renderer import workers
-from wrt.renderer.animate import Animation, animate
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.render import render
@@ -218,12 +216,3 @@ def test_workers_on_devices_of_several_kinds_are_refused(threads: Executor, monk
 def test_bad_options(options: dict[str, Any], argument: str) -> None:
     with refused(argument):
         Options(**options)
-
-
-def test_only_pictures_have_workers(threads: Executor) -> None:
-    assert Options(devices="cpu").devices == ("cpu",)
-    for how in ({"executor": threads}, {"devices": ["cpu", "cpu"]}):
-        with refused(what="runs on one device"):
-            next(animate(SCENE, Animation(frames=2), Options(**how)))
-    with refused("executor"):
-        profile(SCENE, executor=threads)

@@ -15,7 +15,7 @@ from wrt.core.errors import InputError
 from wrt.io.load import load_scene
 from wrt.scene.cameras import Camera, CameraKind, FisheyeCamera, OrthographicCamera, PanoramaCamera
 from wrt.scene.model import Scene
-from wrt.viewer.camera import MOVED, Pose, Steering, camera_toml, orbited_point, pose_of, up_of
+from wrt.viewer.camera import MOVED, Pose, Steering, camera_toml, orbited_point, pose_of
 
 KINDS = (CAMERA, OrthographicCamera(CAMERA.camera_to_world, height=3.25), FisheyeCamera(CAMERA.camera_to_world, fov=3.0),
          PanoramaCamera(CAMERA.camera_to_world))
@@ -94,14 +94,6 @@ def test_a_scene_file_has_the_camera_that_was_written(tmp_path: Path, camera: Ca
     assert type(found) is type(camera) and found.as_in_files() == pytest.approx(camera.as_in_files(), rel=1e-6)
     scale = np.abs(camera.camera_to_world).max()
     np.testing.assert_allclose(found.camera_to_world, camera.camera_to_world, rtol=1e-6, atol=1e-9 * scale)
-
-
-def test_the_up_axis_of_the_viewport() -> None:
-    upright = Camera.look_at((3, 2, 1), (0, 0, 0))
-    assert up_of(upright).tolist() == [0.0, 1.0, 0.0]
-    for camera in (Camera.look_at((0, 5, 0), (0, 0, 0), up=(0, 0, -1)), Camera.look_at((3, 2, 1), (0, 0, 0), up=(0, 0, 1)),
-                   Camera.look_at((3, 2, 1), (0, 0, 0), up=(0, -1, 0))):
-        np.testing.assert_array_equal(up_of(camera), camera.camera_to_world[:3, 1])
 
 
 def test_the_orbited_point() -> None:

@@ -83,20 +83,6 @@ def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeyp
     assert "&lt;b&gt;the disk is full" in shown[2][1]
 
 
-def test_the_picture_in_progress_is_that_of_the_samples_so_far() -> None:
-    taken = []
-
-    def progress(p: Progress) -> None:
-        if p.picture is None:  # kernels are being compiled
-            return
-        film = p.picture()
-        if int(film.samples.min()) == int(film.samples.max()) == p.done / film.samples.size:  # no tile is running
-            taken.append(film)
-
-    wrt.render(SCENE, spp=2, progress=progress)
-    assert taken and np.array_equal(taken[-1].pixels, wrt.render(SCENE, spp=int(taken[-1].samples.max())).pixels)
-
-
 def test_pictures_side_by_side_keep_their_pixels() -> None:
     film = wrt.render(SCENE, spp=2)
     codes = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import http.server
 import io
 import math
 import os
 import shutil
-import socket
-import sys
-import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator
@@ -43,24 +39,10 @@ PATIENCE = 25.0  # Seconds, since a busy machine draws slowly and may have to co
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
-def test_without_websockets_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    result = run("view", WHITTED)
-    assert result.code == 2 and result.out == "" and result.errors == [result.err.strip()]
-    assert 'pip install "wrt[viewer]"' in result.err
-
-
-@pytest.mark.parametrize(("host", "port", "part"), [
-    ("127.0.0.1", None, "Address already in use"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
-def test_an_address_that_cannot_be_listened_on(host: str, port: int | None, part: str) -> None:
+def test_an_address_that_cannot_be_listened_on() -> None:
     pytest.importorskip("websockets")
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1] if port is None else port
-        result = run("view", WHITTED, "--host", host, "--port", port, "--no-open")
-    assert result.code == 2 and result.out == "" and len(result.errors) == 1
-    assert part in result.err and f"port {port}" in result.err and "--port" in result.err
+    result = run("view", WHITTED, "--host", "no.such.host.invalid", "--port", 0, "--no-open")
+    assert result.code == 2 and result.out == "" and len(result.errors) == 1 and "no.such.host.invalid" in result.err
 
 
 def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,19 +164,6 @@ def test_pictures_are_those_of_render(page: Any) -> None:
         for name, value in (("bounces", 3), ("exposure", 0.0), ("tone mapping", "none")):
             somebody.set(name, value)
         wait(lambda: page.viewer.shown.done and page.viewer.shown.view.max_depth == 3, somebody)
-
-
-def test_a_camera_beyond_the_numbers_is_dropped(page: Any) -> None:
-    with client(page.url) as somebody:
-        somebody.open()
-        for _ in range(1000):
-            somebody.send("move", kind="dolly", by=[2.0, 0.0, 0.0])
-        wait(lambda: any("error: " in line for line in page.warnings), somebody)
-        somebody.send("reset")
-        somebody.move(0.1)
-        somebody.picture()
-        somebody.send("reset")
-        wait(lambda: np.array_equal(page.viewer.view.camera.camera_to_world, CAMERA.camera_to_world), somebody)
 
 
 def place_of(camera: Any, size: tuple[int, int], point: np.ndarray) -> tuple[float, float]:
@@ -422,33 +391,3 @@ def test_a_phone_shares_the_view_and_shows_the_whole_width(page: Any, window: An
     assert phone.mistakes == []
     phone.close()
     until(lambda: window.inner_text("#title") == "a box", window)
-
-
-def test_a_page_of_another_origin_has_no_access(page: Any, window: Any, chromium: Any) -> None:
-    """In a real browser, even with the token: a page from another port or another host name has no access."""
-    port, token, before = page.port, page.server.access.token, page.server.browsers
-
-    class Stranger(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(b"<!doctype html><title>stranger</title>")
-
-        def log_message(self, *rest: Any) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Stranger) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        stranger = chromium.new_page()
-        stranger.goto(f"http://127.0.0.1:{server.server_port}/")
-        for way in (f"/{token}/", "/"):
-            for name in ("127.0.0.1", "localhost"):
-                opened = stranger.evaluate(
-                    "address => new Promise(done => { const s = new WebSocket(address);"
-                    " s.onopen = () => done('open'); s.onclose = s.onerror = () => done('closed'); })", f"ws://{name}:{port}{way}")
-                read = stranger.evaluate("address => fetch(address).then(r => r.text()).catch(() => 'nothing')",
-                                         f"http://{name}:{port}{way}")
-                assert (opened, read) == ("closed", "nothing"), (name, way)
-        stranger.close()
-        server.shutdown()
-    assert page.server.browsers == before

@@ -14,7 +14,6 @@ import pytest
 import wrt
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE as PINHOLE
-from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
@@ -27,7 +26,7 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.viewer import refine as module
-from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Shown, Viewer
+from wrt.viewer.refine import Shown, Viewer
 
 # A box on a mirror, seen through an open lens, because the viewer always compiles a lens. All tests here share one kernel.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
@@ -113,34 +112,6 @@ def test_a_camera_that_never_rests_is_followed() -> None:
     assert len({shown.view for shown in eye.pictures}) == 6
 
 
-def test_the_first_picture_is_as_fine_as_there_is_time_for() -> None:
-    eye = Eye()
-    view = replace(eye.viewer.view, size=(1280, 720))
-    for scale in SCALES:
-        eye.viewer._pace["bvh"] = 0.99 * COARSE * scale**2 / (1280 * 720)
-        assert eye.viewer._pace.scales(view) == [each for each in SCALES[::-1] if each <= scale]
-    eye.viewer._pace["bvh"] = 1.0
-    assert eye.viewer._pace.scales(view) == list(SCALES[::-1])
-
-
-def test_a_structure_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = []
-
-    def counted(geometry: Any, accel: str, *arguments: Any, **options: Any) -> Any:
-        made.append(accel)
-        return build(geometry, accel, *arguments, **options)
-
-    monkeypatch.setattr("wrt.renderer.prepare.build", counted)
-    eye = Eye(spp=1)
-    pinhole = replace(CAMERA, aperture_radius=0.0)
-    for changes in ({"size": (61, 34)}, {"size": (30, 40)}, {"camera": turned(30.0)}, {"max_depth": DEEPEST}, {"camera": pinhole}):
-        assert eye.see(**changes).done
-    assert made == ["bvh8"]
-    eye.see(accel="bvh8")  # "bvh" is an alias of "bvh8", but each name has its own renderer
-    eye.see(accel="bvh")
-    assert made == ["bvh8", "bvh8"] and eye.words[-1] == ""
-
-
 def test_nothing_is_rendered_twice() -> None:
     eye = Eye()
     eye.see(size=(61, 34))
@@ -164,16 +135,6 @@ def test_another_tone_keeps_the_film() -> None:
     np.testing.assert_array_equal(eye.pictures[-1].codes, replace(film, exposure=-1.5, tonemap="aces").to_srgb8())
 
 
-def test_again_shows_the_last_picture_once_more() -> None:
-    eye = Eye()
-    last = eye.see(size=(61, 34))
-    pictures = len(eye.pictures)
-    eye.viewer.again()
-    eye.viewer.step()
-    assert len(eye.pictures) == pictures + 1
-    np.testing.assert_array_equal(eye.pictures[-1].codes, last.codes)
-
-
 def test_auto_exposure_is_that_of_render() -> None:
     eye = Eye(SCENE.with_settings(exposure=0.5, auto_exposure=True))
     shown = eye.see(size=(61, 34))
@@ -182,12 +143,6 @@ def test_auto_exposure_is_that_of_render() -> None:
     eye.viewer.tone(auto_exposure=False)
     eye.viewer.step()
     np.testing.assert_array_equal(eye.pictures[-1].codes, replace(expected, exposure=0.5).to_srgb8())
-
-
-def test_a_target_error_ends_the_refinement() -> None:
-    eye = Eye(spp=4096, target_error=0.05)
-    shown = eye.see(size=(61, 34))
-    assert shown.done and shown.spp < 4096 and shown.error <= 0.05
 
 
 def test_an_unknown_structure_is_refused() -> None:
