@@ -28,7 +28,8 @@ from wrt.kernels.shade.sampling import (
     unit_float,
     where_vec3,
 )
-from wrt.kernels.structs import kernel, unit
+from wrt.kernels.structs import kernel
+from wrt.kernels.structs import unit as device_unit
 
 
 @kernel
@@ -369,7 +370,7 @@ def test_search_cdf(weights, before):
 @kernel
 def unit_kernel(v: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.vec3), warps: wp.array(dtype=wp.vec3)):
     i = wp.tid()
-    out[i] = unit(v[i])
+    out[i] = device_unit(v[i])
     warps[i] = wp.normalize(v[i])
 
 
