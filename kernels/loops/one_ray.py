@@ -15,11 +15,11 @@ from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import AovFilm, Film, Pixel, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
 from wrt.kernels.shade.follow_up import FOLLOWED, add_cuts, make_follow_up
-from wrt.kernels.shade.paths import make_path, make_paths
+from wrt.kernels.shade.paths import Path, camera_path, ray_of
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.shade.shadows import Shadow, make_transmittance
-from wrt.kernels.shade.step import DirectLight, Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.step import DirectLight, Sample, Shaded, Step, add_light, add_surface_light, make_step, receives_light
 from wrt.kernels.shade.surface import with_normal
 from wrt.kernels.structs import Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
 
@@ -39,7 +39,6 @@ class Tile:
 
 def make_direct_light(features: Features, accel_struct: Any, transmittance: Any, step: Step) -> Any:
     """Return direct_light, which traces one shadow ray to each light, and to each of Features.extra_lights."""
-    Shaded = make_shaded(features.counting)
     light_point = make_light_points(features).point
 
     @wp.func
@@ -62,8 +61,7 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
 
 def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
     """Return radiance(accel, surfaces, lighting, limits, camera_ray, key, index) -> Sample of a camera ray and all rays that it causes."""
-    Path = make_path(features.counting)
-    paths, shading = make_paths(features.counting), make_shading(features)
+    shading = make_shading(features)
     step, follow_up = make_step(features, shading), make_follow_up(features)
     background_radiance = BACKGROUNDS[features.background].radiance
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
@@ -74,13 +72,13 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
                  index: wp.uint32) -> Sample:
         out = Sample()
         stack = wp.zeros(shape=wp.static(features.stack_size), dtype=Path)
-        stack[0] = paths.camera_path(camera_ray, key)
+        stack[0] = camera_path(camera_ray, key)
         size = int(1)
         traced = int(0)
         while size > 0:
             size = size - 1
             path = stack[size]
-            ray = paths.ray_of(path)
+            ray = ray_of(path)
             out.rays += 1
             traced += 1
             hit = closest_hit(accel, surfaces, ray)

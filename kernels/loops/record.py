@@ -10,14 +10,13 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.follow_up import FollowUp
-from wrt.kernels.shade.paths import make_path
+from wrt.kernels.shade.paths import Path
 from wrt.kernels.shade.shadows import Shadow
-from wrt.kernels.shade.step import DirectLight, ShadowRequest, make_shaded
+from wrt.kernels.shade.step import DirectLight, Shaded, ShadowRequest
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Hit, Ray, Surfaces
 
 RAYS, ENDS, LIGHTS = (wp.constant(i) for i in range(3))  # Entries of Record.used.
-Path, Shaded = make_path(False), make_shaded(False)
 
 
 @wp.struct

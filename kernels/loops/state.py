@@ -17,14 +17,12 @@ from wrt.kernels.rows import Rows
 from wrt.kernels.shade import sampling, textures
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.paths import make_path, make_paths
+from wrt.kernels.shade.paths import Path, ray_of
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import PendingLight, Sample
 from wrt.kernels.shade.surface import Surface, Triangle
 from wrt.kernels.structs import Emitter
 
-Path = make_path(False)
-ray_of = make_paths(False).ray_of
 # Constants of Python for the C++ headers of kernels/shade. A header implements functions of the Python file of the same name: a C++
 # function and its Python function have one name and return the same bits (tests/kernels/shade/test_twins.py).
 LAYOUT_H = constants({name: getattr(sampling, name) for name in (

@@ -11,7 +11,6 @@ from wrt.kernels.loops.state import (
     MISS_COLORS,
     MISS_DIRECTIONS,
     Outcomes,
-    Path,
     RayQueue,
     Wave,
     lanes_kernel,
@@ -32,15 +31,12 @@ from wrt.kernels.query import load_render_ray, store_render_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, add_cuts, make_follow_up
-from wrt.kernels.shade.paths import make_paths
+from wrt.kernels.shade.paths import Path, camera_path
 from wrt.kernels.shade.shading import Shading, make_shading
 from wrt.kernels.shade.shadows import begin_shadow
-from wrt.kernels.shade.step import DirectLight, Sample, ShadowRequest, Step, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.step import DirectLight, Sample, Shaded, ShadowRequest, Step, add_surface_light, make_step, receives_light
 from wrt.kernels.shade.surface import with_normal
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive
-
-Shaded = make_shaded(False)
-camera_path = make_paths(False).camera_path
 
 
 @wp.struct

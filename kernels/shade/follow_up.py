@@ -9,9 +9,9 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.shade.features import Features
-from wrt.kernels.shade.paths import make_path
+from wrt.kernels.shade.paths import Path
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
-from wrt.kernels.shade.step import PendingLight, Sample, make_shaded, mean3
+from wrt.kernels.shade.step import PendingLight, Sample, Shaded, mean3
 from wrt.kernels.structs import Limits, Surfaces
 
 MAX_RAYS = wp.constant(1 << 16)  # Rays of one sample, without shadow rays: as many as a full binary tree of 15 bounces.
@@ -49,7 +49,6 @@ def add_cuts(before: Sample, next: FollowUp) -> Sample:
 
 def make_follow_up(features: Features) -> Any:
     """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp. traced: number of the sample's rays without shadow rays."""
-    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
 
     @wp.func
     def lost(surfaces: Surfaces, path: Path, verdict: int) -> float:

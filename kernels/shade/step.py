@@ -4,7 +4,6 @@ It is Whitted 1980, "An Improved Illumination Model for Shaded Display", without
 a shadow request for each light, and at most four new paths: straight on through a partly transparent surface, reflected, refracted,
 and reflected by a clear coat. Each path carries its throughput. follow_up.py decides which paths are followed and which are cut."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -13,7 +12,7 @@ from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.paths import COATED, ONWARD, REFLECTED, REFRACTED, UNKNOWN, make_path, make_paths
+from wrt.kernels.shade.paths import COATED, ONWARD, REFLECTED, REFRACTED, UNKNOWN, Path, child
 from wrt.kernels.shade.sampling import cap_point, make_sample_2d
 from wrt.kernels.shade.shading import BLEND, Shading, Texels
 from wrt.kernels.shade.shadows import OUTSIDE, Shadow, attenuation
@@ -23,27 +22,20 @@ from wrt.kernels.structs import Lighting, Material, Ray, Surfaces, any_positive
 FACET = wp.constant(2)  # Dimension of the samples that choose a microfacet; 0 is the film, 1 the lens.
 
 
-@cache
-def make_shaded(counting: bool) -> Any:
-    """Return the struct Shaded, the result of `shade`. `counting` is Features.counting."""
-    path_struct = make_path(counting)
+@wp.struct
+class Shaded:
+    """The result of shading a path's hit. A path of throughput 0 means no path."""
 
-    @wp.struct
-    class Shaded:
-        """The result of shading a path's hit. A path of throughput 0 means no path."""
-
-        light: wp.vec3  # Emission and the ambient term, unless it is occluded.
-        throughput: wp.vec3  # Weight of this surface's light in the sample.
-        surface: Surface  # The surface at the hit, where shadow rays start.
-        scatter: Scatter
-        wo: wp.vec3  # Unit vector from the hit to the origin of the path's ray.
-        key: wp.uint32  # Seed of the light samples.
-        onward: path_struct  # Straight through a partly transparent surface.
-        reflected: path_struct
-        refracted: path_struct
-        coated: path_struct  # Reflected by the clear coat.
-
-    return Shaded
+    light: wp.vec3  # Emission and the ambient term, unless it is occluded.
+    throughput: wp.vec3  # Weight of this surface's light in the sample.
+    surface: Surface  # The surface at the hit, where shadow rays start.
+    scatter: Scatter
+    wo: wp.vec3  # Unit vector from the hit to the origin of the path's ray.
+    key: wp.uint32  # Seed of the light samples.
+    onward: Path  # Straight through a partly transparent surface.
+    reflected: Path
+    refracted: Path
+    coated: Path  # Reflected by the clear coat.
 
 
 @wp.struct
@@ -160,8 +152,6 @@ def make_transparency(features: Features, is_solid: Any) -> Any:
 
 def make_straight_on(features: Features, is_solid: Any) -> Any:
     """Return straight_on(surfaces, path, m, surface, share, distance) -> Path behind a blended surface."""
-    Path = make_path(features.counting)
-    child = make_paths(features.counting).child
 
     @wp.func
     def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
@@ -181,8 +171,6 @@ def make_straight_on(features: Features, is_solid: Any) -> Any:
 
 def make_shade(features: Features, shading: Shading) -> Any:
     """Return shade(surfaces, lighting, path, surface, texels, t, facet) -> Shaded."""
-    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
-    child = make_paths(features.counting).child
     transparency, straight_on = make_transparency(features, shading.is_solid), make_straight_on(features, shading.is_solid)
 
     @wp.func
@@ -249,7 +237,7 @@ class Step(NamedTuple):
 
 def make_step(features: Features, shading: Shading) -> Step:
     """Return the Step of a scene."""
-    Shaded, sample_2d = make_shaded(features.counting), make_sample_2d(features)
+    sample_2d = make_sample_2d(features)
     sample_light, reflected_light = make_reflected_light(features)
 
     @wp.func
