@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from IPython.display import DisplayHandle
     from PIL import Image
 
+
 SHARE = 0.1  # largest share of the time that may go into showing pictures
 
 
@@ -59,11 +60,6 @@ class LiveView:
         done = progress.picture is not None and progress.done == progress.total
         if begin < self._due and not done:
             return
-        self._show(progress)
-        now = time.monotonic()
-        self._due = now + max(self.every, (now - begin) / SHARE)
-
-    def _show(self, progress: Progress) -> None:
         if progress.stage == "compile":
             text = COMPILING
         else:
@@ -76,6 +72,8 @@ class LiveView:
             self._handle = self._display(self._html(page), display_id=True)
         else:
             self._handle.update(self._html(page))
+        now = time.monotonic()
+        self._due = now + max(self.every, (now - begin) / SHARE)
 
 
 TITLE, GAP = 22, 8  # pixels: height of a title above a picture, and space between pictures

@@ -29,7 +29,7 @@ from wrt.viewer.refine import Shown, Viewer
 from wrt.viewer.server import Browser, Server, listen, to_stderr
 
 MOST_PIXELS = 1 << 23  # Largest number of pixels of a picture; a larger window shows the picture enlarged.
-QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture.
+QUALITY = 90  # JPEG quality of a picture that gets finer.
 WIDEST = math.radians(160.0)  # Horizontal angle of view that a narrow window may widen a camera to.
 DARK_SHARE = 0.01  # Share of visibly too dark pixels above which the page warns.
 FOLDER = Path(__file__).parent / "page"
@@ -150,7 +150,7 @@ class Page:
         self._tell("activity", {"text": text})
 
     def _show(self, shown: Shown) -> None:
-        data = encode_png(shown.codes) if shown.done else jpeg(shown.codes, QUALITY[shown.scale == 1])
+        data = encode_png(shown.codes) if shown.done else jpeg(shown.codes)
         inspected = self.rays.shown
         overlay = [] if inspected is None else inspected.overlay(shown.view.camera, shown.view.size)
         self._tell("picture", {"mime": "image/png" if shown.done else "image/jpeg", "size": shown.view.size, "overlay": overlay,
@@ -218,10 +218,10 @@ def widened(camera: CameraKind, size: tuple[int, int]) -> CameraKind:
     return replace(camera, least_fov_x=max(camera.least_fov_x, least))
 
 
-def jpeg(codes: np.ndarray, quality: int) -> bytes:
+def jpeg(codes: np.ndarray) -> bytes:
     """Encode display codes (h, w, 3) uint8 as a JPEG file."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(codes).save(out, "JPEG", quality=quality)
+    Image.fromarray(codes).save(out, "JPEG", quality=QUALITY)
     return out.getvalue()
