@@ -92,8 +92,8 @@ class RaycastingScene:
             mesh = vertex_positions
         if mesh is not None:
             vertex_positions, triangle_indices = _arrays_of(mesh)
-        vertices = np.array(_numbers(vertex_positions, "vertex_positions", "(N, 3)"))
-        indices = _numbers(triangle_indices, "triangle_indices", "(N, 3)")
+        vertices = np.array(real_numbers(vertex_positions, "vertex_positions", "(N, 3)"))
+        indices = real_numbers(triangle_indices, "triangle_indices", "(N, 3)")
         with np.errstate(invalid="ignore"):
             faces = indices.astype(np.int64)
         for array, name in ((vertices, "vertex_positions"), (faces, "triangle_indices")):
@@ -243,15 +243,6 @@ def _threads(nthreads: int) -> int:
     return thread_count(max(as_integer(nthreads, "nthreads", -(1 << 31), (1 << 31) - 1), 0) or None)
 
 
-def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """Convert an array or tensor to a NumPy array of real numbers. Raises InputError that names the argument and its `shape`."""
-    try:
-        value = value.cpu().numpy() if hasattr(value, "cpu") else value
-    except (RuntimeError, TypeError) as error:  # torch raises them for tensors with gradients and for types that NumPy lacks
-        raise InputError(str(error), argument=name) from error
-    return real_numbers(value, name, shape)
-
-
 def _arrays_of(mesh: Any) -> tuple[Any, Any]:
     """Return positions and indices of a mesh of another library."""
     if hasattr(mesh, "vertex"):
@@ -265,7 +256,7 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
 
 def _rows(value: Any, name: str, width: int, origin: np.ndarray | None) -> tuple[tuple[int, ...], np.ndarray]:
     """Return the leading shape of `value`, (..., width), and its rows minus `origin`, (N, width) float32."""
-    array = _numbers(value, name, f"(..., {width})")
+    array = real_numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
     rows = array.reshape(-1, width)
@@ -336,7 +327,7 @@ def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: i
 
 
 def _matrix(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    array = _numbers(value, name, str(shape)).astype(np.float64)
+    array = real_numbers(value, name, str(shape)).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"must be {shape} finite numbers, got {shown(value)}", argument=name)
     return array

@@ -205,17 +205,9 @@ def test_rays_of_a_pinhole() -> None:
         np.testing.assert_allclose(rays + [0, 0, 0, shift, 0, 0], looking, atol=1e-6)
 
 
-class Refuses:
-    """A tensor that cannot be converted to NumPy."""
-
-    def cpu(self) -> Any:
-        raise RuntimeError("it requires grad")
-
-
 def test_what_is_refused() -> None:
     scene, pinhole = scene_of(BOX), RaycastingScene.create_rays_pinhole
     for call, told in ((lambda: scene.cast_rays(np.zeros((3, 5))), ("rays", "6)")),
-                       (lambda: scene.cast_rays(Refuses()), ("rays", "requires grad")),
                        (lambda: scene.compute_occupancy(np.zeros(3), nsamples=2), ("nsamples", "odd")),
                        (lambda: scene.test_occlusions(np.zeros((3, 6)), tfar=[1, 2]), ("tfar", "(3,)")),
                        (lambda: scene.add_triangles(np.zeros((3, 3)), [[0, 1, 3]]), ("triangle_indices", "0 to 2")),
