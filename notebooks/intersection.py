@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench.meshes import terrain
+from wrt.lab.bench.rays import terrain
 from wrt.lab.hard_cases.cases import generate, judge
 from wrt.lab.oracle.oracle import closest
 from wrt.picture.heatmap import heatmap

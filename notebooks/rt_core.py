@@ -17,8 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench.meshes import terrain
-from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.rays import ray_sets, terrain
 from wrt.lab.rtcore import whatif
 from wrt.lab.rtcore.meshes import in_warps
 from wrt.lab.rtcore.model import TERMS, predict, trace_rays

@@ -14,8 +14,7 @@ import numpy as np
 
 import wrt
 from wrt.lab.bench import error
-from wrt.lab.bench.meshes import terrain
-from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.rays import ray_sets, terrain
 from wrt.lab.bench.report import run
 from wrt.lab.oracle.oracle import closest, t_bound
 from wrt.picture.heatmap import colored

@@ -14,8 +14,7 @@ import numpy as np
 
 import wrt
 from wrt.lab.bench import Queries
-from wrt.lab.bench.meshes import in_stadium
-from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.rays import in_stadium, ray_sets
 from wrt.lab.bench.report import run
 from wrt.picture.heatmap import heatmap
 from wrt.scene.shapes import teapot

@@ -14,8 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench.meshes import terrain
-from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.rays import ray_sets, terrain
 from wrt.lab.walk.walk import Section
 from wrt.renderer.inspector.section import Plane, cut
 from wrt.scene.shapes import merged, quad, teapot

@@ -21,8 +21,7 @@ from wrt.core.checks import as_integer
 from wrt.core.device import load_kernel, start
 from wrt.core.threads import run_all, thread_count
 from wrt.io.load import load_scene
-from wrt.lab.bench.meshes import terrain
-from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.rays import RaySet, ray_sets, terrain
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
 from wrt.lab.hard_cases.cases import HARD_CASES, generate
 from wrt.renderer.options import Options

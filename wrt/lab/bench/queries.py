@@ -19,8 +19,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import QUERY_KINDS
 from wrt.lab.bench import Queries as Plan
 from wrt.lab.bench.contestants import RAYS, RIVALS, Contestant, Own, contestant, installed
-from wrt.lab.bench.meshes import in_stadium, small_worlds, terrain
-from wrt.lab.bench.rays import RaySet, counters_of, inward, points_around, ray_sets, tiles
+from wrt.lab.bench.rays import RaySet, counters_of, in_stadium, inward, points_around, ray_sets, small_worlds, terrain, tiles
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate_on, spread, with_seconds
 from wrt.scene.mesh import Mesh

@@ -13,7 +13,7 @@ from wrt.core.device import launch_on, load_kernel, start, upload
 from wrt.core.errors import InputError
 from wrt.kernels.study.rasterize import rasterize
 from wrt.lab.bench import Visibility as Plan
-from wrt.lab.bench.meshes import terrain
+from wrt.lab.bench.rays import terrain
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.timing import alternate, spread
 from wrt.renderer.upload import camera_rays, camera_struct

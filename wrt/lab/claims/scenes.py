@@ -13,8 +13,7 @@ from wrt.core.checks import require_known
 from wrt.core.errors import InputError
 from wrt.core.types import PathLike
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.meshes import terrain
-from wrt.lab.bench.rays import OFFSET, ball_around, through_pixels, unit
+from wrt.lab.bench.rays import OFFSET, ball_around, terrain, through_pixels, unit
 from wrt.lab.claims.walks import Rays
 from wrt.lab.rtcore.model import WARP, blocks
 from wrt.scene.mesh import Mesh

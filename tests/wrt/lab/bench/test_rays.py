@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from wrt.accel.scenes.build import build
-from wrt.lab.bench.meshes import in_stadium
-from wrt.lab.bench.rays import RAY_KINDS, ray_sets
+from wrt.lab.bench.rays import RAY_KINDS, in_stadium, ray_sets
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 

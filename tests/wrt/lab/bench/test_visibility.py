@@ -14,7 +14,7 @@ from tests.data import data_path
 from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.io.mesh_file import load_mesh
-from wrt.lab.bench.meshes import terrain
+from wrt.lab.bench.rays import terrain
 from wrt.lab.bench.report import Row
 from wrt.lab.bench.visibility import SURFACES, compared, rasterizer, ray_caster
 from wrt.scene.cameras import Camera, FisheyeCamera
