@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import importlib
 import json
 import math
 import re
@@ -15,12 +14,12 @@ import click
 
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.settings import DEFAULT_DEVICE
+from wrt.lab import looked_up
 from wrt.scene.kinds import forms
 from wrt.scene.settings import MAX_DEPTH, SETTINGS, Settings
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
-    from distributed import Client
 
     from wrt.scene.model import Scene
     from wrt.scene.settings import SettingChanges
@@ -94,10 +93,7 @@ class OneOf(click.ParamType):
 
     def names(self) -> list[str]:
         """Return the table's names."""
-        if not isinstance(self.place, str):
-            return list(self.place)
-        module, table = self.place.split(":")
-        return list(getattr(importlib.import_module(module), table))
+        return list(looked_up(self.place) if isinstance(self.place, str) else self.place)
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return f"[{'|'.join(self.names())}]"
@@ -203,29 +199,6 @@ def depth_hint(stats: dict[str, Any], max_depth: int, option: str = "--max-depth
     return (f"max_depth {max_depth} leaves {100.0 * stats['visibly_cut']:.2g}% of the pixels visibly too dark; in surroundings of"
             f" radiance 1, the cut rays would add {stats['lost_by_depth']:.2g} to the picture's mean: {advice}")
 
-
-def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:
-    """Return the options `device`, `devices` and `executor` of `wrt.render` for --cluster and --device."""
-    names = [name.strip() for name in device.split(",")]
-    if cluster is None:
-        return {"device": device} if len(names) == 1 else {"devices": names}
-    if len(names) > 1:
-        raise InputError("must be one device with --cluster, the device of each worker", argument="--device",
-                         hint="start a worker for each device")
-    return {"device": device, "executor": client_of(cluster)}
-
-
-def client_of(cluster: str | None) -> "Client | None":
-    """Return a Dask client of the scheduler at address `cluster`, connected until the command ends; None if `cluster` is None."""
-    if cluster is None:
-        return None
-    from wrt.renderer.workers import connected
-
-    return click.get_current_context().with_resource(connected(cluster))
-
-
-CLUSTER = click.option("--cluster", metavar="ADDRESS",
-                       help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
 STAGING = option_group("staging", {
     "up": click.option("--up", type=OneOf("wrt.scene.defaults:UP"), default="y", show_default=True,

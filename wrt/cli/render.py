@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import click
 
 from wrt.cli.common import (
-    CLUSTER,
     DURATION,
     STAGING,
     Assignments,
@@ -18,7 +17,6 @@ from wrt.cli.common import (
     OneOf,
     Parsed,
     depth_hint,
-    device_options,
     load,
     naming,
     say,
@@ -46,7 +44,8 @@ if TYPE_CHECKING:
 @shared("spp", "size", "seed")
 @click.option("--device", default=DEFAULT_DEVICE, show_default=True,
               help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
-@CLUSTER
+@click.option("--cluster", metavar="ADDRESS",
+              help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 @shared("threads", "crop", "camera", "max_depth", "min_throughput", "clamp", "filter", "fresnel", "sampler", "assignments", "accel")
 @STAGING
 @click.option("--instancing", type=OneOf("wrt.accel.scenes.instancing:INSTANCING"), default="auto", show_default=True,
@@ -120,7 +119,15 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     settings = settings_of(assignments, options)
     options |= checkpoint_options(output, options.pop("every"), options.pop("file"), options.pop("resume"))
     Scene().with_settings(**settings)
-    options |= device_options(options.pop("cluster"), options.pop("device"))
+    cluster, names = options.pop("cluster"), [name.strip() for name in options.pop("device").split(",")]
+    options |= {"device": names[0]} if len(names) == 1 else {"devices": names}
+    if cluster is not None:
+        if len(names) > 1:
+            raise InputError("must be one device with --cluster, the device of each worker", argument="--device",
+                             hint="start a worker for each device")
+        from wrt.renderer.workers import connected
+
+        options["executor"] = click.get_current_context().with_resource(connected(cluster))
     Options(**options)
     return settings
 
