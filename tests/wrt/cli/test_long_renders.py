@@ -93,14 +93,6 @@ def test_kills_change_nothing() -> None:
 # --- the command line -------------------------------------------------------------------------------------------------
 
 
-def test_a_finished_render_leaves_no_checkpoint() -> None:
-    plain = run("render", "box.obj", *SMALL, "-o", "a.exr")
-    assert plain.code == 0
-    result = run("render", "box.obj", *SMALL, "-o", "b.exr", "--checkpoint", "60s")
-    assert (result.code, result.out) == (0, "b.exr\n") and new_files() == {"a.exr", "b.exr"}
-    assert channels("a.exr") == channels("b.exr")
-
-
 def test_time_limits_and_resumes(folder: Path) -> None:
     options = ("render", "box.obj", "--size", "64x36", "--time-limit", "0.2s", "-o", "a.exr", "--checkpoint-file", "b")
     first = run(*options, "--spp", 1 << 20)

@@ -93,18 +93,6 @@ def test_set_wins_over_the_file_and_stands_beside_flags() -> None:
     assert json.loads(run("info", "scene.toml", "--json").out)["features"]["tinted_shadows"] is False
 
 
-def test_clamp_0_is_no_limit_as_the_help_says() -> None:
-    assert "0: no limit" in " ".join(run("render", "--help").out.split())
-    plain = ("render", "scene.toml", "--size", "20x12", "--json")
-    with_settings("")
-    free = json.loads(run(*plain, "-o", "free.png").out)
-    with_settings("clamp = 0.2")
-    assert json.loads(run(*plain, "-o", "dark.png").out)["clamped_share"] > 0.0 == free["clamped_share"]
-    assert json.loads(run(*plain, "-o", "again.png", "--clamp", "0").out)["clamped_share"] == 0.0
-    assert np.array_equal(read_image("again.png"), read_image("free.png"))
-    assert not np.array_equal(read_image("dark.png"), read_image("free.png"))
-
-
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--set", "fitler=box"], "--set: fitler: unknown key 'fitler'; did you mean 'filter'?"),
     (["--set", "ambient=1"], "--set: ambient: is a key of the scene, not of its settings"),
