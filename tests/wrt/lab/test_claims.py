@@ -17,7 +17,7 @@ from tests.rewalk import INF, WalkRay
 from tests.rewalk import rays as with_hits
 from wrt.accel.bvh.six import Bvh6
 from wrt.accel.geometry import Geometry
-from wrt.lab.bench.meshes import terrain
+from wrt.lab.bench.rays import terrain
 from wrt.lab.claims import Claims as Plan
 from wrt.lab.claims import scenes
 from wrt.lab.claims.claim import CLAIMS, Figure, Study
