@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import importlib
 import json
 import math
 import re
@@ -14,7 +15,6 @@ import click
 
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.lab import looked_up
 from wrt.scene.kinds import forms
 from wrt.scene.settings import MAX_DEPTH, SETTINGS, Settings
 
@@ -93,7 +93,10 @@ class OneOf(click.ParamType):
 
     def names(self) -> list[str]:
         """Return the table's names."""
-        return list(looked_up(self.place) if isinstance(self.place, str) else self.place)
+        if not isinstance(self.place, str):
+            return list(self.place)
+        module, table = self.place.split(":")
+        return list(getattr(importlib.import_module(module), table))
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return f"[{'|'.join(self.names())}]"
