@@ -189,7 +189,7 @@ def test_a_crop_outside_the_picture(crop: str) -> None:
 
 
 @pytest.mark.parametrize(("scene", "message"), [
-    ("nothing.xyz", "nothing.xyz: no such file"), (".", ".: is a directory"), ("box.txt", "box.txt: is no scene file"),
+    ("nothing.xyz", "nothing.xyz: no such file"), (".", ".: is no scene file"), ("box.txt", "box.txt: is no scene file"),
     ("empty.toml", "empty.toml: the scene has no shapes"), ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: has no triangles"),
 ])
 @pytest.mark.parametrize("command", ["render", "validate"])
