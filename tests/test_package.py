@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from tests.data import ROOT
-from wrt.core.settings import VERSION
+from wrt.core import VERSION
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TARGET = re.compile(r"\]\(([^)]+)\)")

@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wrt.core.settings import VERSION as __version__
+from wrt.core import VERSION as __version__
 
 # Type checkers and editors read these imports. At run time __getattr__ imports each name on first use.
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wrt.core import VERSION
 from wrt.core.errors import InputError
 from wrt.core.files import check_writable, read_checked, replacing, write_checked
-from wrt.core.settings import VERSION
 from wrt.core.types import PathLike
 from wrt.renderer.film import DeviceFilm
 from wrt.renderer.options import OPTIONS

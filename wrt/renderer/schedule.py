@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import warp as wp
 
+from wrt.core import VERSION
 from wrt.core.interrupts import held_interrupts
-from wrt.core.settings import VERSION
 from wrt.core.threads import submit
 from wrt.core.types import Device
 from wrt.picture.film import Film

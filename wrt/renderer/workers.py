@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.core import VERSION
 from wrt.core.compiling import WATCH
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
-from wrt.core.settings import VERSION
 from wrt.core.threads import Pool
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
