@@ -45,6 +45,7 @@ COMMANDS: Registry[click.Command] = Registry("command", {
 
 
 GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.
+OUT_OF_MEMORY = ("can't start new thread", "Failed to allocate")  # RuntimeErrors of Python and of Warp begin so
 
 
 @click.group(cls=Commands, commands=COMMANDS, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -75,7 +76,9 @@ def main() -> None:
         cause = error.__cause__ if isinstance(error, click.Abort) else error
         code = exit_code(cause.number if isinstance(cause, Interrupted) else None)
         say("interrupted")
-    except MemoryError as error:
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not str(error).startswith(OUT_OF_MEMORY):
+            raise
         say(f"error: not enough memory: {error}")
         code = 2
     except SystemExit as error:

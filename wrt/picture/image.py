@@ -22,7 +22,7 @@ from wrt.core.files import read_file, replacing
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.picture.decode import FORMATS as FORMATS_READ
-from wrt.picture.decode import check_size, decode_png16, decode_rgba8, hdr_header
+from wrt.picture.decode import check_size, decode_png16, decode_rgba8, read_hdr
 from wrt.picture.tonemap import REC_709, decode_srgb, to_codes, to_rec_709
 
 Metadata = Mapping[str, object]
@@ -38,7 +38,6 @@ METADATA_PREFIX = "wrt:"  # begins the names of text entries
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
 MAX_LINEAR_PIXELS = 1 << 28  # an environment of 24576x10922, or 16384x16384
-MAX_HDR_HEADER = 1 << 16  # bytes
 HALF_MAX = 65504.0
 EXACT_IN_FLOAT = 1 << 24  # float32 represents all integers up to this one
 
@@ -223,9 +222,7 @@ def read_image(path: PathLike, *, environment: bool = False) -> np.ndarray:
         if suffix == ".exr":
             pixels, primaries = _read_exr(path)
         elif suffix == ".hdr":
-            factor, primaries = hdr_header(read_file(path, MAX_HDR_HEADER), MAX_LINEAR_PIXELS)
-            with _opened(path, ".hdr") as source:
-                pixels = _read(source, "float") / factor
+            pixels, primaries = read_hdr(read_file(path), MAX_LINEAR_PIXELS, lambda: _read_runs(path))
         elif suffix in DISPLAY_SUFFIXES:
             data, primaries = read_file(path), REC_709
             formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # TGA files have no magic number: the suffix decides
@@ -293,6 +290,11 @@ def _channels(source: Any, part: int, names: Sequence[str]) -> dict[str, np.ndar
     whole[max(y, 0): max(y + spec.height, 0), max(x, 0): max(x + spec.width, 0)] = block[
         max(-y, 0): max(spec.full_height - y, 0), max(-x, 0): max(spec.full_width - x, 0)]
     return {spec.channelnames[i]: whole[..., i - first] for i in wanted}
+
+
+def _read_runs(path: PathLike) -> np.ndarray:
+    with _opened(path, ".hdr") as source:
+        return _read(source, "float")
 
 
 def _read(source: Any, *where: Any) -> np.ndarray:

@@ -8,11 +8,13 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from PIL import Image
 
 from tests.command_line import BOX_OBJ, Result, without_compiling
@@ -217,6 +219,17 @@ def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, .
     assert result.code == 0, result
     assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]", result.out + result.err)
     assert "\\x1b" in result.out or "\\x07" in result.out
+
+
+def no_thread() -> None:
+    raise RuntimeError("can't start new thread")  # words of CPython's _thread
+
+
+@pytest.mark.parametrize(("ask", "words"), [(lambda: np.empty(1 << 58, np.uint8), "Unable to allocate"), (no_thread, "can't start"),
+                                            (lambda: wp.empty((1 << 20, 1 << 20, 1 << 10)), "Failed to allocate")])
+def test_no_memory_is_no_traceback(ask: Callable[[], object], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.renderer.render.prepare", lambda *arguments: ask())
+    refused(run("render", "box.obj"), f"error: not enough memory: {words}")
 
 
 def test_a_width_alone_keeps_the_scenes_aspect_ratio() -> None:
