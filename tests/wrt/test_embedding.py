@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -109,3 +110,22 @@ def test_arrays_of_structs_are_made_and_read_without_parsing(monkeypatch: pytest
         patch.setattr(ast, "parse", lambda *arguments, **named: (parsed.append(arguments), parse(*arguments, **named))[1])
         work()
     assert not parsed
+
+
+@pytest.mark.parametrize("kib", [64, 512])
+@pytest.mark.parametrize("where", ["there", "here"])
+def test_small_stacks_of_threads_are_not_for_kernels(kib: int, where: str, expected: str) -> None:
+    call = "thread = threading.Thread(target=work); thread.start(); thread.join()" if where == "there" else "work()"
+    assert printed(f"threading.stack_size({kib} << 10); {call}; print(threading.stack_size() >> 10)") == [expected, str(kib)]
+
+
+@pytest.mark.parametrize("name", ["bvh2_kdop", "kdtree"])
+def test_a_thread_with_a_small_stack_builds_and_asks(name: str, expected: str) -> None:
+    code = "threading.stack_size(64 << 10); thread = threading.Thread(target=work); thread.start(); thread.join()"
+    assert printed(code, name) == [expected]
+
+
+def test_a_small_stack_of_the_main_thread(expected: str) -> None:
+    done = subprocess.run(["sh", "-c", f"ulimit -s 256; exec {sys.executable} -c \"$CODE\""], check=True, capture_output=True,
+                          text=True, timeout=600, cwd=ROOT, env={**os.environ, "CODE": f"NAME = 'bvh'\n{WORK}\nwork()"})
+    assert done.stdout.splitlines() == [expected]

@@ -21,7 +21,7 @@ from wrt.core import settings, warp_private
 from wrt.core.building import loading
 from wrt.core.compiling import WATCH
 from wrt.core.errors import InputError, warn
-from wrt.core.threads import run_all, submit, thread_count
+from wrt.core.threads import run_all, submit, thread_count, with_stack
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
 
 MOST_ROWS = (1 << 31) - 1
@@ -144,7 +144,7 @@ def load_kernel(kernel: Kernel, device: Device) -> None:
                 is_cached = all(path.is_file() for path in warp_private.cache_files(kernel, device, place[1]))
                 Path(wp.config.kernel_cache_dir).mkdir(parents=True, exist_ok=True)
                 with nullcontext() if is_cached else WATCH.compiling():
-                    warp_private.load(kernel, device, place[1])
+                    with_stack(partial(warp_private.load, kernel, device, place[1]))
                 loaded.devices.add(place)
 
 

@@ -1,19 +1,23 @@
-"""CPU threads: their number, and tasks on them."""
+"""CPU threads: their number, the size of their stacks, and tasks on them."""
 
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from functools import cache
+from contextlib import contextmanager
+from functools import cache, partial
 from typing import Generic, ParamSpec, TypeVar
 
 from wrt.core.checks import as_integer
 
 MOST_THREADS = 1 << 10
+# Bytes of a stack. Kernels have arrays on it: queries crash with 256 KiB, renders with 512, the compiler with 768 (Linux, x86-64).
+STACK = 2 << 20
 P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
+_here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def thread_count(threads: int | None) -> int:
@@ -23,12 +27,62 @@ def thread_count(threads: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
+@cache
+def _stack_limit() -> float:
+    """Return the bytes of the main thread's stack, or infinity if unknown. New threads have the same if threading.stack_size() is 0."""
+    try:
+        import resource
+    except ImportError:
+        return float("inf")
+    limit = resource.getrlimit(resource.RLIMIT_STACK)[0]
+    return float("inf") if limit == resource.RLIM_INFINITY else limit
+
+
+@cache
+def _stack_size_lock(process: int) -> threading.Lock:
+    """Return a process's lock of threading.stack_size(). No thread of a forked process would release the lock of its parent process."""
+    return threading.Lock()
+
+
+@contextmanager
+def _large_stacks() -> Iterator[bool]:
+    """Give threads that start in the block stacks of STACK bytes or more. Yield True if the default stack is that large.
+
+    threading.stack_size() holds for the whole process, and each call sets it."""
+    with _stack_size_lock(os.getpid()):
+        before = threading.stack_size(STACK)
+        large = (before or _stack_limit()) >= STACK
+        if large:
+            threading.stack_size(before)
+        try:
+            yield large
+        finally:
+            if not large:
+                threading.stack_size(before)
+
+
+def _has_stack() -> bool:
+    """Return True if this thread's stack has STACK bytes. A user's thread is assumed to have the stack of threads that start now."""
+    if not hasattr(_here, "large"):
+        if threading.current_thread() is threading.main_thread():
+            _here.large = _stack_limit() >= STACK
+        else:
+            with _large_stacks() as _here.large:
+                pass
+    return bool(_here.large)
+
+
 class Pool(ThreadPoolExecutor):
-    """Pool of threads. After the end of Python's main thread, where the standard pool refuses tasks, `submit` runs a task at once."""
+    """Pool of threads with large stacks. After the end of Python's main thread, where the standard pool refuses tasks, `submit` runs a task
+    at once."""
+
+    def __init__(self, threads: int, name: str = "wrt") -> None:
+        super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
 
     def submit(self, task: Callable[P, T], /, *arguments: P.args, **named: P.kwargs) -> Future[T]:
         if threading.main_thread().is_alive():
-            return super().submit(task, *arguments, **named)
+            with _large_stacks():
+                return super().submit(task, *arguments, **named)
         future = Future[T]()
         try:
             future.set_result(task(*arguments, **named))
@@ -48,9 +102,19 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
     return _pool(os.getpid()).submit(task, *arguments, **named)
 
 
+def with_stack(task: Callable[[], T]) -> T:
+    """Run a task that runs or compiles kernels; on another thread if the stack of this thread is small.
+
+    On a small stack, kernels and the compiler end the process with a segmentation fault."""
+    return task() if _has_stack() else submit(task).result()
+
+
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run all tasks on `threads` threads, including this one. After an error no task starts; the error is raised in the end."""
-    jobs = list(tasks)
+    with_stack(partial(_run_all, list(tasks), threads))
+
+
+def _run_all(jobs: list[Callable[[], None]], threads: int) -> None:
     if threads == 1 or len(jobs) <= 1:
         for job in jobs:
             job()
@@ -90,7 +154,7 @@ def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], It
     waiting, running = deque(tasks), dict[Future[object], Callable[[], Iterable[T]]]()
     while waiting and threads == 1:
         job, after = begin(waiting.popleft())
-        job()
+        with_stack(job)
         waiting.extend(after())
     try:
         while waiting or running:
@@ -126,8 +190,11 @@ class FreeList(Generic[T]):
         self.free.append(thing)
 
     def run(self, task: Callable[[T], R]) -> R:
-        """Run a task with a free thing."""
-        thing = self.take()
-        result = task(thing)
-        self.give(thing)
-        return result
+        """Run a task, which may launch kernels, with a free thing."""
+        def run() -> R:
+            thing = self.take()
+            result = task(thing)
+            self.give(thing)
+            return result
+
+        return with_stack(run)

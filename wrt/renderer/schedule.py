@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ import warp as wp
 
 from wrt.core import VERSION
 from wrt.core.interrupts import held_interrupts
-from wrt.core.threads import submit
+from wrt.core.threads import submit, with_stack
 from wrt.core.types import Device
 from wrt.picture.film import Film
 from wrt.picture.tonemap import auto_exposure
@@ -73,7 +74,7 @@ class LocalTracer:
         if min(self.prepared.threads, len(work)) == 1:  # the calling thread: another thread would cost 5 % of a small picture
             done, next_step = 0, time.monotonic() + STEP_SECONDS
             for job in work:
-                done += trace(job)
+                done += with_stack(partial(trace, job))
                 if time.monotonic() >= next_step or due():
                     yield done, True
                     next_step = time.monotonic() + STEP_SECONDS
