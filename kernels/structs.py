@@ -37,8 +37,20 @@ else:
         return kernel(function, registers=80)
 
     def noinline(function):
-        """Make a Warp function that is called, never inlined. Functions that run once per block or wave then compile faster."""
-        return wp.func(function, inline=False)
+        """Make a Warp function that is called, never inlined. Functions that run once per block or wave then compile faster.
+        Warp 1.17 has no such option."""
+        return wp.func(function) if wp.config.version.startswith("1.17.") else wp.func(function, inline=False)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(mask);
+#else
+    return __builtin_popcount(mask);
+#endif
+""")
+def bit_count(mask: int) -> int:
+    """Count the bits of a mask that are 1."""
 
 
 @wp.func_native("""

@@ -100,3 +100,13 @@ def test_the_page_for_the_next_version_lists_every_word_and_file() -> None:
     page = (ROOT / "docs" / "warp.md").read_text()
     for each in (*native_words(), *FOR_INSIDES, "tests/virtual_gpu/warp_private.py", "kernels/launches.py"):
         assert f"`{each}`" in page or f"(../{each})" in page, each
+
+
+def test_warp_1_17_compiles_all_indices() -> None:
+    """Before the field of an array's element, Warp 1.17 reads no index that is itself a field or an element: a variable must hold it."""
+    for path in SOURCES:
+        if path.is_relative_to(ROOT / "kernels"):
+            elements = [node.value for node in ast.walk(ast.parse(path.read_text()))
+                        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Subscript)]
+            found = [ast.unparse(each) for each in elements if isinstance(each.slice, ast.Attribute | ast.Subscript)]
+            assert [text for text in found if not text.startswith("BACKGROUNDS[")] == [], path

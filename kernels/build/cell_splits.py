@@ -17,6 +17,7 @@ import warp as wp
 from wrt.kernels.build.cells import OCTANTS, Cell, CellOptions, CellWork, Rule, Split
 from wrt.kernels.build.clip import ZERO, Box, Shapes, areas_of_parts, clip_to_cell, corner_of, meets_cell, triangle_cell
 from wrt.kernels.build.records import BuildRecord
+from wrt.kernels.structs import bit_count
 from wrt.kernels.traverse.plane_layouts import LEAF, PLANE, octant_corner, octree_planes
 from wrt.kernels.traverse.planes import SMALLEST
 from wrt.kernels.units.box import half_area
@@ -266,7 +267,7 @@ def choose_octants(shapes: Shapes, work: CellWork, cell: Cell, options: CellOpti
                         met = met | (1 << k)
             mask = met
         work.sides[i] = wp.uint8(mask)
-        total += wp.bit_count(mask)
+        total += bit_count(mask)
     for k in range(8):
         count = int(0)
         for i in range(cell.first, cell.first + cell.count):

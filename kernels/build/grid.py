@@ -64,7 +64,8 @@ def sort_by_cell(begin: wp.array(dtype=wp.int64), cell_of: wp.array(dtype=wp.int
     """Sort the primitives by cell, and within a cell by index: a counting sort in one thread. On entry, all `cells` must be 0.
     Primitive i meets the cells cell_of[begin[i]] .. cell_of[begin[i + 1] - 1]."""
     for r in range(cell_of.shape[0]):
-        cells[cell_of[r]].count += 1
+        cell = cell_of[r]
+        cells[cell].count += 1
     total = int(0)
     for c in range(cells.shape[0]):
         cells[c].first = total

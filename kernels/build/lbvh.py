@@ -156,7 +156,8 @@ def write_nodes(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(d
         slot = slot + 1
         node = tree.nodes[parent]
         if node.count_1 == 0 and node.first_1 == at and node.count_0 == 0:
-            slot = slot + tree.summaries[node.first_0].inner_nodes
+            sibling = node.first_0
+            slot = slot + tree.summaries[sibling].inner_nodes
         at = parent
     node = tree.nodes[i]
     left = SubtreeSummary()

@@ -185,10 +185,11 @@ def measure_halves(data: BuildData, task: BuildTask, middle: int) -> Halves:
 @wp.func
 def link_to_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
     """Store a finished range in its parent node: a leaf (count > 0), or the inner node `first` (count = 0)."""
-    if task.parent >= 0:
+    parent = task.parent
+    if parent >= 0:
         if task.side == 0:
-            nodes[task.parent].first_0 = first
-            nodes[task.parent].count_0 = count
+            nodes[parent].first_0 = first
+            nodes[parent].count_0 = count
         else:
-            nodes[task.parent].first_1 = first
-            nodes[task.parent].count_1 = count
+            nodes[parent].first_1 = first
+            nodes[parent].count_1 = count

@@ -138,10 +138,12 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
     for m in range(moves.shape[0]):
         move = moves[m]
         if move.gain > 0.0:
-            parent = links[move.node].parent
+            node = move.node
+            target = move.target
+            parent = links[node].parent
             sibling = wp.where(links[parent].left == move.node, links[parent].right, links[parent].left)
             grandparent = links[parent].parent
-            above = links[move.target].parent
+            above = links[target].parent
             involved = Six(move.node, parent, sibling, move.target, grandparent, above)
             taken = int(0)
             for k in range(6):
@@ -155,14 +157,14 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
                     touched[involved[k]] = wp.uint8(1)
                 replace_child(links, grandparent, parent, sibling)
                 refit_up(links, areas, grandparent, scale)
-                above = links[move.target].parent
+                above = links[target].parent
                 replace_child(links, above, move.target, parent)
                 links[parent].left = move.node
                 links[parent].right = move.target
-                links[move.node].parent = parent
-                links[move.target].parent = parent
-                links[parent].lo = wp.min(links[move.node].lo, links[move.target].lo)
-                links[parent].hi = wp.max(links[move.node].hi, links[move.target].hi)
+                links[node].parent = parent
+                links[target].parent = parent
+                links[parent].lo = wp.min(links[node].lo, links[target].lo)
+                links[parent].hi = wp.max(links[node].hi, links[target].hi)
                 areas[parent] = area_of(links[parent].lo, links[parent].hi, scale)
                 refit_up(links, areas, above, scale)
 

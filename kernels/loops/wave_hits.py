@@ -76,10 +76,11 @@ def make_load_hits(has: Attributes) -> Any:
                 place = Place()
                 place.face = hit_triangle(wave, surfaces, j)
                 hit.triangle = triangle_at(surfaces, place)
-            hit.material = surfaces.prim_material[prim_id]
+            material = surfaces.prim_material[prim_id]
+            hit.material = material
             if wp.static(tangents):
-                hit.is_mapped = wp.where(surfaces.materials[hit.material].normal_texture >= 0, 1, 0)
-                hit.normal_scale = surfaces.materials[hit.material].normal_scale
+                hit.is_mapped = wp.where(surfaces.materials[material].normal_texture >= 0, 1, 0)
+                hit.normal_scale = surfaces.materials[material].normal_scale
             hit.u = wave.queue.hits.u[k]
             hit.v = wave.queue.hits.v[k]
             hit.direction = wave.queue.rays.direction[k]

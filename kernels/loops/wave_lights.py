@@ -56,7 +56,8 @@ def make_keep_diffuse(features: Features) -> Any:
             drawn = Drawn()
             drawn.i = -1
             place = place_of(surfaces, wave.queue.hits.prim_id[wave.outcomes.hit_rays[first + i]])
-            if surfaces.materials[place.material].transmission < 1.0:
+            material = place.material
+            if surfaces.materials[material].transmission < 1.0:
                 drawn.i = kept
                 store_point(rows, kept, load_point(rows, i))
                 kept += 1
@@ -121,8 +122,9 @@ def make_sample_mesh(features: Features) -> Any:
             chosen, within = choose_emitter(lighting, light, xi[0])
             at.xi = wp.vec2(within, xi[1])
             at.emitter = lighting.emitters[chosen]
-            at.emission = surfaces.materials[at.emitter.material].emission
-            at.two_sided = surfaces.materials[at.emitter.material].two_sided
+            material = at.emitter.material
+            at.emission = surfaces.materials[material].emission
+            at.two_sided = surfaces.materials[material].two_sided
             store_emitter(rows, i, at)
 
     @wp.func

@@ -58,7 +58,8 @@ def make_follow_up(features: Features) -> Any:
         lost = mean3(path.throughput)
         if wp.static(features.refraction):
             if path.medium >= 0:  # Inside glass the radiance is ior^2 times as high, and `scatter` divided by ior^2.
-                lost = lost * surfaces.materials[path.medium].ior * surfaces.materials[path.medium].ior
+                medium = path.medium
+                lost = lost * surfaces.materials[medium].ior * surfaces.materials[medium].ior
         return lost
 
     @wp.func

@@ -160,8 +160,9 @@ def make_shading(features: Features) -> Any:
         """Return the interpolated or mapped normal, made visible from wo as `visible_normal` does."""
         n = s.shading
         if wp.static(features.normal_maps):
-            if surfaces.materials[s.material].normal_texture >= 0:
-                n = bump(s, surfaces.materials[s.material].normal_scale, texels.normal)
+            material = s.material
+            if surfaces.materials[material].normal_texture >= 0:
+                n = bump(s, surfaces.materials[material].normal_scale, texels.normal)
         if wp.static(features.smooth or features.normal_maps):
             if wp.dot(n, wo) < MIN_COSINE:  # Rarely true; the rest of `visible_normal` is slow.
                 n = visible_normal(n, wo)

@@ -92,27 +92,30 @@ def make_visits(units: Units, node_bytes: int) -> Any:
         if wp.static(logged):
             write_step(recorder, ray.slot, make_step(NODE, index, 0))
         if wp.static(observed):
+            slot = ray.slot
             if wp.static(not logged):
                 write_fetch(recorder, ray.slot, wp.int64(index) * wp.int64(wp.static(size)), wp.static(size))
-            recorder.counts[ray.slot].nodes += 1
-            recorder.counts[ray.slot].boxes += boxes
-            recorder.counts[ray.slot].box_operations += operations
-            recorder.counts[ray.slot].node_bytes += wp.static(size)
+            recorder.counts[slot].nodes += 1
+            recorder.counts[slot].boxes += boxes
+            recorder.counts[slot].box_operations += operations
+            recorder.counts[slot].node_bytes += wp.static(size)
 
     @wp.func
     def root(recorder: Recorder, ray: Ray, lo: wp.vec3, hi: wp.vec3, t: float):
         if wp.static(logged):
             write_step(recorder, ray.slot, box_step(0, INNER, lo, hi, t))
         if wp.static(observed):
-            recorder.counts[ray.slot].boxes += 1
-            recorder.counts[ray.slot].box_operations += 1
+            slot = ray.slot
+            recorder.counts[slot].boxes += 1
+            recorder.counts[slot].box_operations += 1
 
     @wp.func
     def leaf(recorder: Recorder, ray: Ray, first: int, count: int):
         if wp.static(logged):
             write_step(recorder, ray.slot, make_step(LEAF, first, count))
         if wp.static(observed):
-            recorder.counts[ray.slot].leaves += 1
+            slot = ray.slot
+            recorder.counts[slot].leaves += 1
 
     return node, root, leaf
 
@@ -124,11 +127,12 @@ def make_primitive(units: Units) -> Any:
     @wp.func
     def primitive(recorder: Recorder, ray: Ray, index: int):
         if wp.static(observed):
+            slot = ray.slot
             if wp.static(not logged):
                 address = PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(size))
                 write_fetch(recorder, ray.slot, address, wp.static(size))
-            recorder.counts[ray.slot].primitives += 1
-            recorder.counts[ray.slot].primitive_bytes += wp.static(size)
+            recorder.counts[slot].primitives += 1
+            recorder.counts[slot].primitive_bytes += wp.static(size)
 
     return primitive
 
@@ -145,8 +149,9 @@ def make_stack_steps(units: Units) -> Any:
             step.prim_id = below
             write_step(recorder, ray.slot, step)
         if wp.static(observed):
-            recorder.counts[ray.slot].pushes += 1
-            recorder.counts[ray.slot].stack = wp.max(recorder.counts[ray.slot].stack, size)
+            slot = ray.slot
+            recorder.counts[slot].pushes += 1
+            recorder.counts[slot].stack = wp.max(recorder.counts[slot].stack, size)
 
     @wp.func
     def pop(recorder: Recorder, ray: Ray, index: int, count: int, t: float, result: int):
@@ -156,7 +161,8 @@ def make_stack_steps(units: Units) -> Any:
             step.result = result
             write_step(recorder, ray.slot, step)
         if wp.static(observed):
-            recorder.counts[ray.slot].pops += 1
+            slot = ray.slot
+            recorder.counts[slot].pops += 1
 
     return push, pop
 
@@ -172,7 +178,8 @@ def make_observer(units: Units, node_bytes: int) -> Observer:
     @wp.func
     def finish(recorder: Recorder, ray: Ray, best: Hit) -> Hit:
         if wp.static(units.observer != "" and not units.instances):  # with instances, the upper level counts the ray
-            recorder.counts[ray.slot].probes += 1
+            slot = ray.slot
+            recorder.counts[slot].probes += 1
         if best.prim_id == NO_HIT:
             best.t = float(wp.inf)
             best.prim_id = -1

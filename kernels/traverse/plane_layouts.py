@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.structs import bit_count
 from wrt.kernels.traverse.common import Probe
 
 MAX_LEVELS = 20  # Levels of an octree: corners of cells, in units of the finest cell, are integers that are exact in float32.
@@ -189,7 +190,7 @@ def octree_child(node: OctreeNode, place: Octants, above: bool) -> Octants:
         out.mask = mask
         out.half = place.half
     else:
-        out.index = node.first + wp.bit_count(-node.count & (mask - 1))
+        out.index = node.first + bit_count(-node.count & (mask - 1))
         out.mask = 0xFF
         out.half = place.half >> 1
     return out

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, bit_count, largest, size_of
 from wrt.kernels.traverse import plane_layouts as at
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.leaf import Mailbox, make_leaf, make_mailbox_leaf
@@ -263,7 +263,7 @@ def make_walk(layout: Layout, units: Units, any_hit: bool, accepts: Any) -> Any:
                 if wp.static(not octants):
                     observe.node(accel.recorder, probe.ray, place, 0, 1)
                 elif place.axis == 0:
-                    observe.node(accel.recorder, probe.ray, place.index, wp.bit_count(-node.count), 1)
+                    observe.node(accel.recorder, probe.ray, place.index, bit_count(-node.count), 1)
                 if wp.static(log):
                     log_cut(accel, probe, node, place, part, reach)
                 cut = cut_part(layout.plane(accel, node, place, probe), part, reach.drift)

@@ -1,6 +1,6 @@
 """Private parts of Warp: names, layouts of arguments, texts, file names, the compiler. No other module of the host uses them.
 
-Device code uses private parts only in kernels/warp_private.py. All assumptions are about Warp 1.19 (WORKS_WITH): `prepare` and the
+Device code uses private parts only in kernels/warp_private.py. All assumptions are about Warp 1.17 to 1.19 (WORKS_WITH): `prepare` and the
 self-test in wrt.accel.queries.raw_launches refuse a Warp that differs. docs/warp.md lists each assumption and its test."""
 
 import ctypes
@@ -23,12 +23,12 @@ from wrt.core.compiling import shared_headers
 from wrt.core.errors import InputError
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 
-WORKS_WITH = "warp-lang>=1.19,<1.20"  # as in pyproject.toml
+WORKS_WITH = "warp-lang>=1.17,<1.20"  # as in pyproject.toml
 Record: TypeAlias = ctypes.Structure  # a kernel argument in the memory layout of the kernel
 
 
 def refusal(what: str) -> InputError:
-    """Return the error for a Warp whose private part `what` differs from Warp 1.19."""
+    """Return the error for a Warp whose private part `what` differs from those that wrt knows."""
     return InputError(f"Warp {wp.config.version} is not supported, its insides differ ({what})", hint=f"install '{WORKS_WITH}'")
 
 
@@ -211,7 +211,9 @@ def is_warps_error(error: BaseException) -> bool:
 _CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "verify_autograd_array_access": False, "llvm_cuda": False,
            "enable_vector_component_overwrites": False, "default_grid_stride": True}
 _OPTIONS = {"max_unroll": 16, "deterministic": _NOT_GUARANTEED, "deterministic_max_records": 0}
-_FLAGS = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
+# Flags for the CPU of Warp 1.19. Clang of 1.17 and 1.18 refuses them.
+_FLAGS = {"1.17": "", "1.18": ""}.get(
+    wp.config.version[:4], "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4")
 # Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
 _KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
 
@@ -223,7 +225,7 @@ def _is_own_module(module: Any) -> bool:
 
 def _own_flags(flags: str | None) -> str:
     """Return the flags for the CPU of wrt's modules. flags: wp.config.cpu_compiler_flags."""
-    return " ".join([*_KEPT_FLAG.findall("-march=native" if flags is None else flags), _FLAGS])
+    return " ".join([*_KEPT_FLAG.findall("-march=native" if flags is None else flags), *_FLAGS.split()])
 
 
 @wraps(_resolve_options)
@@ -239,7 +241,7 @@ context.Module.resolve_options = _own_options  # at once, because kernels are ha
 # The changes below make Warp's compiler faster, and change no result of a kernel. They act only while a module of wrt is compiled. Each
 # names the processor time that it saves in a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
 
-_REPLACED = {  # replaced functions, with their parameters in Warp 1.19
+_REPLACED = {  # replaced functions, with their parameters in Warp 1.17 to 1.19
     ("Module", "resolve_options"): ("self", "config", "block_dim"),
     ("Module", "_compile"): ("self", "device", "output_dir", "output_name", "output_arch", "use_ptx", "options"),
     ("codegen", "codegen_struct"): ("struct", "device", "indent_size", "include_tile_helpers"),
@@ -255,7 +257,7 @@ _here = threading.local()  # own: True while this thread compiles a module of wr
 def prepare() -> None:
     """Change Warp's compiler for the modules of wrt. Call it after wp.init() and before the first kernel is compiled.
 
-    Raises InputError if the replaced functions differ from those of Warp 1.19."""
+    Raises InputError if the replaced functions differ from these."""
     owners = {"Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
     for (owner, name), parameters in _REPLACED.items():
         found = getattr(owners[owner], name, None)
@@ -304,7 +306,7 @@ def _drop_unused_helpers() -> None:
 def _compile_well() -> None:
     """Share precompiled headers between all threads and processes (saves 6.4 s).
 
-    Warp 1.19 precompiles its headers in every thread that compiles. With FLAGS, the templates of the headers are compiled once, not with
+    Warp precompiles its headers in every thread that compiles. With FLAGS, the templates of the headers are compiled once, not with
     each kernel, and values have no names (0.4 of the 6.4 s). A kernel whose source begins with `#define WP_NO_BFLOAT16` gets headers
     without bfloat16 (0.4 s)."""
     compile_object, own_headers = build.build_cpu, context.runtime.get_clang_pch_dir

@@ -83,7 +83,7 @@ def refused_for(differ: str) -> None:
     with pytest.raises(InputError) as error:
         raw_launches.check_raw_launches()
     assert str(error.value) == (f"Warp {wp.config.version} is not supported, its insides differ ({differ});"
-                                f" install 'warp-lang>=1.19,<1.20'")
+                                f" install '{warp_private.WORKS_WITH}'")
 
 
 @pytest.mark.usefixtures("not_tested")
