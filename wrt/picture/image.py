@@ -154,11 +154,9 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray) -> None:
 
 
 def _write_hdr(path: PathLike, pixels: np.ndarray) -> None:
-    oiio = _oiio()
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
     clipped = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
-    _write_oiio(path, spec, clipped)
+    _write_oiio(path, _oiio().ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float"), clipped)
 
 
 def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:

@@ -136,6 +136,9 @@ def test_points_inside() -> None:
         assert np.array_equal(inside[clear], ((farthest < 0.5) & (farthest > 0.25))[clear])
     points[0, 0] = np.nan
     assert not scene_of(BOX).compute_occupancy(points).numpy()[0, 0].any()
+    for again in (BOX.faces, BOX.faces[:, ::-1]):  # copies of faces have an inside
+        twice = scene_of(SimpleNamespace(vertices=BOX.vertices, faces=np.concatenate([BOX.faces, again])))
+        assert twice.compute_occupancy([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0]]).numpy().tolist() == [1.0, 0.0]
     open_box = BOX.copy()
     open_box.update_faces(np.arange(12) != 3)
     inside = scene_of(open_box).compute_occupancy(np.full((1, 3), 0.1), nsamples=15).numpy()

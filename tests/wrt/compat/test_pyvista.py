@@ -112,6 +112,23 @@ def test_segments_that_end_short_of_the_mesh_and_those_without_length() -> None:
         assert tracer.ray_trace(*ends)[0].shape == (0, 3)
 
 
+def test_points_stay_on_rays_along_an_axis() -> None:
+    ball, grid = pv.Sphere(), np.stack(np.meshgrid(np.arange(-4, 5) * 0.1, np.arange(-4, 5) * 0.1), axis=-1).reshape(-1, 2)
+    origins, ball.points = np.column_stack([np.full(len(grid), -5.0), grid]), np.array(ball.points, np.float64)
+    points, ray, _ = RayTracer(ball).multi_ray_trace(origins, np.tile([1.0, 0.0, 0.0], (len(grid), 1)))
+    assert len(points) > 80 and np.array_equal(points[:, 1:], origins[ray, 1:])
+    assert (RayTracer(ball).ray_trace(origins[40], origins[40] * [-1, 1, 1])[0][:, 1:] == origins[40, 1:]).all()
+
+
+def test_arguments_of_plots_and_meshes_without_cells() -> None:
+    plate, ends = RayTracer(pv.Plane().triangulate()), ([0.1, 0.2, 1], [0.1, 0.2, -1])
+    assert len(plate.ray_trace(*ends, False, False, None)[1]) == 1
+    with refused("plot", "draws nothing"):
+        plate.ray_trace(*ends, plot=True)
+    with pytest.raises(pv.NotAllTrianglesError, match="It has no cells"):
+        RayTracer(pv.PolyData()).ray_trace(*ends)
+
+
 def test_wrt_build_names_the_function() -> None:
     with refused("mesh", "got a pyvista.PolyData", hint="to_mesh"):
         wrt.build(pv.Cube())

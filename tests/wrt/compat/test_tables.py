@@ -75,6 +75,58 @@ def test_rows_for_open3d() -> None:
     assert np.isnan(own["hits"].normal[misses]).all() and not names["answer"]["primitive_normals"].numpy()[misses].any()
 
 
+def test_meshes_of_open3d() -> None:
+    o3d = pytest.importorskip("open3d", reason="Open3D is not installed")
+    old = o3d.geometry.TriangleMesh.create_box()
+    new = o3d.t.geometry.TriangleMesh.from_legacy(old)
+    for arrays in ((old.vertices, old.triangles), (new.vertex.positions, new.triangle.indices)):
+        assert wrt.build(arrays).closest_hit(np.float32([[0.3, 0.4, 5, 0, 0, -1]])).t.tolist() == [4.0]
+
+
+def test_rows_for_pyvista() -> None:
+    pv = pytest.importorskip("pyvista", reason="PyVista is not installed")
+    from wrt.compat.pyvista import RayTracer, to_polydata
+
+    ball, plate, ends = to_polydata(MESHES[0]), pv.Plane(i_resolution=1, j_resolution=1).triangulate(), ([-2, 0.1, 0.2], [2, 0.1, 0.2])
+    first = [each.ray_trace(*ends, first_point=True)[0][0] for each in (RayTracer(ball), ball)]
+    assert first[0] < 0 < first[1]
+    assert [len(each.ray_trace([-1, 0.1, 0], [1, 0.1, 0])[1]) for each in (plate, RayTracer(plate))] == [2, 0]  # in the plane of a face
+
+
+def test_rows_for_embree() -> None:
+    pytest.importorskip("embreex", reason="embreex is not installed")
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene, rays = EmbreeScene(), [np.ascontiguousarray(half) for half in (RAYS[:, :3], RAYS[:, 3:])]
+    for mesh in MESHES:
+        TriangleMesh(scene, mesh.vertices[mesh.faces])
+    theirs, hits = scene.run(*rays, output=True), wrt.build(wrt.Scene.of(MESHES)).closest_hit(*rays)
+    hit = theirs["primID"] >= 0
+    assert np.array_equal(hits.hit, hit) and np.array_equal(hit, scene.run(*rays, query="OCCLUDED") >= 0)
+    for ours, name in ((hits.face, "primID"), (hits.object, "geomID"), (hits.t, "tfar"), (hits.u, "u"), (hits.v, "v")):
+        same(ours[hit], theirs[name][hit])
+    same(hits.normal[hit], theirs["Ng"][hit] / np.linalg.norm(theirs["Ng"][hit], axis=1, keepdims=True))
+
+
+def test_rows_for_mitsuba() -> None:
+    mi = pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    mi.set_variant("scalar_rgb")
+    parts: dict[str, Any] = {"type": "scene"}
+    for i, mesh in enumerate(MESHES):
+        parts[f"m{i}"] = mi.Mesh(f"m{i}", len(mesh.vertices), len(mesh.faces))
+        of = mi.traverse(parts[f"m{i}"])
+        of["vertex_positions"], of["faces"] = mesh.vertices.ravel(), mesh.faces.ravel()
+        of.update()
+    scene, hits = mi.load_dict(parts), wrt.build(wrt.Scene.of(MESHES)).closest_hit(RAYS)
+    for i, row in enumerate(RAYS[:100].tolist()):
+        ray = mi.Ray3f(mi.Point3f(*row[:3]), mi.Vector3f(*row[3:]))
+        si = scene.ray_intersect(ray)
+        assert si.is_valid() == scene.ray_test(ray) == hits.hit[i] and (not hits.hit[i] or si.prim_index == hits.face[i])
+        if hits.hit[i]:
+            same(np.float32([si.t, *si.p, *si.n]), np.float32([hits.t[i], *hits.point[i], *hits.normal[i]]))
+
+
 def test_rows_for_trimesh_with_rtree() -> None:
     """Points, distances and sides agree; at edges and corners the faces differ, and a face's normal is no side."""
     trimesh = pytest.importorskip("trimesh")

@@ -99,6 +99,11 @@ def test_channels_without_colours_are_refused_and_named(names: str, tmp_path: Pa
         read_image(path)
 
 
+def test_whole_numbers_are_kept(tmp_path: Path) -> None:
+    ids = np.array([[[10, 20, 30], [0, 1, 1 << 24]]], np.uint32)
+    assert np.array_equal(read_image(save(tmp_path / "a.exr", (specification(ids, kind="uint"), ids))), ids)
+
+
 # --- primaries --------------------------------------------------------------------------------------------------------
 
 
@@ -152,6 +157,13 @@ def test_bad_pixels_of_an_environment_are_replaced_and_counted(tmp_path: Path) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.array_equal(read_image(path), pixels, equal_nan=True)  # for `compare`: as the file has it
+
+
+def test_an_infinite_sun_in_other_primaries_stays_white(tmp_path: Path) -> None:
+    pixels = np.array([[[np.inf] * 3, [1.0, 1.0, 1.0]]], np.float32)
+    with pytest.warns(SceneWarning, match="1 pixel negative, NaN or infinite"):
+        sky = read_image(save(tmp_path / "a.exr", (with_primaries(pixels, AP0), pixels)), environment=True)
+    assert sky[0, 0] == pytest.approx([65504.0] * 3, rel=1e-5)
 
 
 def test_a_cube_map_is_refused(tmp_path: Path) -> None:

@@ -35,18 +35,13 @@ def in_runs(rows: np.ndarray) -> bytes:
 @pytest.mark.parametrize("packed", [False, True], ids=["flat", "runs"])
 @pytest.mark.parametrize(("first", "second", "axes"), [(*signs, axes) for signs in itertools.product("+-", "+-") for axes in ("YX", "XY")])
 def test_each_of_the_eight_orientations(first: str, second: str, axes: str, packed: bool, tmp_path: Path) -> None:
-    height, width = 9, 12
-    rgbe = np.random.default_rng(0).integers(128, 256, (height, width, 4), dtype=np.uint8)
+    rgbe = np.random.default_rng(0).integers(128, 256, (9, 12, 4), dtype=np.uint8)
     rgbe[..., 3] = 130
     right = rgbe[..., :3] * np.float32(2.0 ** (130 - 136))
-    # The file holds lines along its second axis; "-Y" goes down from the top, "+X" to the right.
-    lines = rgbe if axes == "YX" else rgbe.swapaxes(0, 1)
-    down, along = (first, second) if axes == "YX" else (second, first)
-    flips = {"Y": down == "+", "X": along == "-"}
-    for axis, letter in enumerate(axes):
-        lines = np.flip(lines, axis) if flips[letter] else lines
-    size = {"Y": height, "X": width}
-    line = f"{first}{axes[0]} {size[axes[0]]} {second}{axes[1]} {size[axes[1]]}"
+    signs = dict(zip(axes, (first, second), strict=True))  # "-Y" goes down from the top, "+X" to the right; lines go along the second
+    lines = rgbe[:: 1 if signs["Y"] == "-" else -1, :: 1 if signs["X"] == "+" else -1]
+    lines = lines if axes == "YX" else lines.swapaxes(0, 1)
+    line = f"{first}{axes[0]} {lines.shape[0]} {second}{axes[1]} {lines.shape[1]}"
     assert np.array_equal(read(tmp_path, line, in_runs(lines) if packed else lines.tobytes()), right)
 
 
