@@ -26,7 +26,7 @@ OF_OTHERS = {"_digest": "a row of bench error",
 CLICK = {"wrt/cli/common.py", "wrt/cli/reporting.py", "wrt/cli/measure.py"}  # files that use `params` of click's commands
 TEXTS = re.compile(r"\b_?wp_|WP_[A-Z]|Warp CUDA|NVIDIA CUDA")
 # Words of Warp's C++ that the native code of kernels/ may use.
-NATIVE = {"wp::vec_t", "wp::float32", "wp::float64", "wp::uint64", "wp::launch_bounds_t"}
+NATIVE = {"wp::atomic_add", "wp::vec_t", "wp::float32", "wp::float64", "wp::uint64", "wp::launch_bounds_t"}
 
 
 def made_here() -> frozenset[str]:

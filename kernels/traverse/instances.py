@@ -40,7 +40,7 @@ def make_struct(bottom: Any) -> Any:
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
         bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).
-        slack: float  # Factor by which `enter` widens boxes.
+        slack: wp.array(dtype=float)  # For the root of each tree in `nodes`: factor by which `enter` widens boxes.
         recorder: Recorder
 
     return Instances
@@ -61,7 +61,7 @@ def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> 
     In the structure's space, origin o and direction d are rounded to float32: a point is off by u (|o| + t |d|) per axis. A hit may
     be 17 u t |d| outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the
     world, that is at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
-    (wrt.accel.instances). The rounding of this test adds 4.
+    (kernels.build.moves). The rounding of this test adds 4.
 
     slack = 32 u max |A| |A^-1| covers these errors; |A| is the largest sum of absolute values in a row. So the returned t is never greater
     than the t of a hit inside, and no hit is lost, in any order of visits.
@@ -191,7 +191,7 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
     def set_up(accel: struct, probe: Probe) -> WidenedRay:
         out = WidenedRay()
         out.box = probe.box
-        out.slack = accel.slack
+        out.slack = accel.slack[probe.ray.first_prim]
         return out
 
     @wp.func

@@ -9,15 +9,15 @@ namespace wrt {
 // --- nodes of the upper level -------------------------------------------------------------------------------------------------
 
 // Return how far a node's boxes are widened on each side for a ray: by slack times the distance of the origin to the farthest corner of the
-// box around all of them, which follows the references. `enter` widens each box by its own farthest corner, so at most as much.
-template <class T> WRT_INLINE T widening(const float* node, const Vec3<T>& origin, float slack) {
+// box around all of them. The box and slack follow the references. `enter` widens each box by its own farthest corner, so at most as much.
+template <class T> WRT_INLINE T widening(const float* node, const Vec3<T>& origin) {
     const float* const box = node + REFERENCES + WIDTH;
     T farthest = {};
     for (int k = 0; k < 6; ++k) {
         const T distance = absolute(box[k] - origin[k % 3]);
         farthest = distance > farthest ? distance : farthest;
     }
-    return slack * farthest;
+    return box[6] * farthest;
 }
 
 // The origins from which a ray meets the near and the far planes of boxes as it would meet those of wider boxes. Their rounding is at most
@@ -37,10 +37,10 @@ template <class T> WRT_INLINE Origins<T> shifted(const BoxRay<T>& ray, T widenin
 
 // As `children`, for a node of the upper level: of a copy with wider boxes.
 template <bool ANY_HIT>
-WRT_CALLED int top_children(const float* nodes, float slack, float* packet, int node, int mask, unsigned* stack, int size) {
+WRT_CALLED int top_children(const float* nodes, float* packet, int node, int mask, unsigned* stack, int size) {
     const float* const from = nodes + (long long)node * NODE_SIZE;
     const float *const a = packet + BEAM_NEAR_ORIGIN, *const b = packet + BEAM_FAR_ORIGIN;
-    const float one = widening(from, Vec3<float>{{a[0], a[1], a[2]}}, slack), other = widening(from, Vec3<float>{{b[0], b[1], b[2]}}, slack);
+    const float one = widening(from, Vec3<float>{{a[0], a[1], a[2]}}), other = widening(from, Vec3<float>{{b[0], b[1], b[2]}});
     const float pad = one > other ? one : other;
     alignas(4 * CACHE_LINE) float planes[NODE_SIZE];
     for (int k = 0; k < 6; ++k) store(planes + WIDTH * k, load<Children>(from + WIDTH * k) + (k % 2 ? pad : -pad));
@@ -49,21 +49,21 @@ WRT_CALLED int top_children(const float* nodes, float slack, float* packet, int 
 }
 
 // As `step`, for a node of the upper level.
-template <bool ANY_HIT> WRT_INLINE int top_step(const float* nodes, float slack, float* packets, unsigned* stacks, int bottom, int* slot) {
+template <bool ANY_HIT> WRT_INLINE int top_step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
     const int first = slot[SLOT_NEXT] * NODE_SIZE;
     const float* const node = nodes + (long long)first;
     const OneRay ray = {packets + slot[SLOT_RAY]};
     const BoxRay<float> box = {vector<float>(ray, ORIGIN_X), vector<float>(ray, INVERSE_X)};
-    const Origins<float> from = shifted(box, widening(node, box.origin, slack));
+    const Origins<float> from = shifted(box, widening(node, box.origin));
     return step_at<ANY_HIT>(nodes, node, first, from.near, from.far, packets, stacks, bottom, slot);
 }
 
 // As rays_meeting_root, for the root of a world.
-WRT_CALLED int rays_meeting_top(const float* nodes, float slack, float* packet, int node, int mask) {
+WRT_CALLED int rays_meeting_top(const float* nodes, float* packet, int node, int mask) {
     const float* const root = nodes + (long long)node * NODE_SIZE;
     const PacketRay ray = packet_ray({packet});
     const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
-    const Origins<Rays> from = shifted(box, widening(root, ray.origin, slack));
+    const Origins<Rays> from = shifted(box, widening(root, ray.origin));
     return rays_meeting(root, ray, from.near, from.far, mask, packet);
 }
 

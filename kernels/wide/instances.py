@@ -80,7 +80,7 @@ class TopSteps(NamedTuple):
 
 @cache
 def make_top_steps(any_hit: bool) -> TopSteps:
-    hits, memory = flag(any_hit), "accel.wide.data, accel.slack, scratch.packets.data"
+    hits, memory = flag(any_hit), "accel.wide.data, scratch.packets.data"
     stack = f"scratch.stacks.data, {STACK_WORDS} * slot, scratch.slots.data + {SLOT_SIZE} * slot"
 
     @wp.func_native(f"return wrt::top_children<{hits}>({memory} + base, reference, mask, scratch.stacks.data, size);")

@@ -93,6 +93,54 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
         assert (expected.prim_id >= 0).any()
 
 
+def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eagerly and in a graph: no copy, no allocation, no wait. The graph's hits are those of a structure on the CPU."""
+    scenes = [[(icosphere(1), 3)], [(icosphere(2), 2), (icosphere(1), 4)]]
+    worlds = [wrt.Scene(tuple(wrt.Object(mesh, (wrt.Material(),)) for mesh, n in each for _ in range(n))) for each in scenes]
+    accel, rng = wrt.build(worlds, device="cuda:0"), np.random.default_rng(2)
+    rays = [wp.array(each, dtype=wp.vec3, device="cuda:0") for each in rng.normal(size=(2, 500, 3))]
+    world = wp.array(np.arange(500) % 2, dtype=wp.int32, device="cuda:0")
+    bodies, poses = wp.array([7, 1], dtype=wp.int32, device="cuda:0"), wp.zeros(9, dtype=wp.transformf, device="cuda:0")
+    some = wp.zeros(2, dtype=wp.mat44f, device="cuda:0")
+    out = accel.closest_hit(*rays, world=world)
+
+    def step() -> Hits:
+        accel.move(poses)
+        accel.move(bodies, some)
+        return accel.closest_hit(*rays, world=world, out=out)
+
+    step()
+    step()
+    allocated: list[int] = []
+    monkeypatch.setattr(gpus().memory, "allocate", lambda *sizes: allocated.extend(sizes))
+    counts = gpus().counts
+    copies, waits, launches = counts.copies.copy(), counts.synchronisations, counts.launches.total()
+    step()
+    with wp.ScopedCapture("cuda:0") as capture:
+        hits = step()
+    assert (counts.copies, counts.synchronisations, counts.launches.total(), allocated) == (copies, waits, launches + 5, [])
+    monkeypatch.undo()
+    for _ in range(2):
+        quaternions, matrices = rng.normal(size=(9, 4)), np.tile(np.eye(4), (2, 1, 1)) + 0.2 * rng.normal(size=(2, 4, 4))
+        matrices[:, 3] = [0.0, 0.0, 0.0, 1.0]
+        poses.assign(np.concatenate([0.5 * rng.normal(size=(9, 3)), quaternions], axis=1))
+        some.assign(matrices)
+        copies, launches = counts.copies.copy(), counts.launches.total()
+        wp.capture_launch(capture.graph)
+        assert counts.copies == copies and counts.launches.total() == launches + 5
+        expected = wrt.build(worlds, device="cpu")
+        expected.move(wp.array(poses.numpy(), dtype=wp.transformf, device="cpu"))
+        expected.move(bodies.to("cpu"), some.to("cpu"))
+        found = expected.closest_hit(*(each.numpy() for each in rays), world=world.numpy())
+        assert (found.prim_id >= 0).sum() > 50
+        for name in FIELDS:
+            assert getattr(out, name).numpy().tobytes() == getattr(found, name).tobytes()
+        assert hits.instance.numpy().tobytes() == found.instance.tobytes() and hits.point.numpy().tobytes() == found.point.tobytes()
+        assert np.array_equal(accel.geometry.to_world, expected.geometry.to_world)
+    with pytest.raises(InputError, match="must be on cuda:0"):
+        accel.move(bodies.to("cpu"), some.to("cpu"))
+
+
 def test_the_example_in_the_documentation() -> None:
     page = (ROOT / "docs/moving.md").read_text(encoding="utf-8")
     section = page[page.index("## On a GPU") :]

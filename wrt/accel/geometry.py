@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 
 import numpy as np
 import warp as wp
 
+from wrt.core.arrays import to_numpy
 from wrt.core.device import records, upload
 from wrt.core.files import checksum_of
 from wrt.core.threads import run_all
@@ -213,7 +214,11 @@ class InstancedGeometry:
     @property
     def is_placed(self) -> np.ndarray:
         """Mask of instances, (I,) bool: True for one object with its own transform, False for joined objects."""
-        return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
+        return np.array([not isinstance(part, NumberedGeometry) for part in self.parts], bool)[self.part]
+
+    def now(self) -> InstancedGeometry:
+        """Return the instances with the present matrices, which no move changes."""
+        return InstancedGeometry(*(getattr(self, each.name) for each in fields(self)))
 
     def near_zero(self, rows: np.ndarray, matrices: np.ndarray) -> np.ndarray:
         """Convert matrices (R, 3, 4) of the instances `rows` from the caller's mesh and world to those of `to_world`."""
@@ -226,12 +231,21 @@ class InstancedGeometry:
         return out
 
 
+class MovedGeometry(InstancedGeometry):
+    """Instances that move in place. places: Warp array (3 I,) of vec4d, the rows of the matrices."""
+
+    places: WarpArray
+
+    def __init__(self, geometry: InstancedGeometry, places: WarpArray) -> None:
+        self.__dict__.update({**geometry.now().__dict__, "places": places})
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """Copy of the present matrices on the host."""
+        return to_numpy(self.places).reshape(-1, 3, 4).copy()
+
+
 def inverse_of(matrices: np.ndarray) -> np.ndarray:
     """Invert affine maps (I, 3, 4) in float64."""
     linear = np.linalg.inv(matrices[:, :, :3])
     return np.concatenate([linear, -(linear @ matrices[:, :, 3:])], axis=2)
-
-
-def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
-    """Return the growth of rounding errors from a mesh's own space to world space: largest row sum of |A| |A^-1|, (I,)."""
-    return np.asarray((np.abs(to_world[:, :, :3]) @ np.abs(to_local[:, :, :3])).sum(axis=2).max(axis=1, initial=1.0))

@@ -1,25 +1,30 @@
 """Upper level of instances: a binary tree for each world, all in one array of nodes. For the traversal of many rays
-(kernels.wide.instances) the same trees have nodes with eight children."""
+(kernels.wide.instances) the same trees have nodes with eight children. Moves: kernels/build/moves.py."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
+from wrt.accel.base import OneMesh
 from wrt.accel.bvh.builders import BvhOptions, half_areas
-from wrt.accel.geometry import Geometry, InstancedGeometry, inverse_of, spread_of
-from wrt.core.device import empty_aligned, on_host, records, start, upload
-from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.accel.geometry import MAX_SPREAD, InstancedGeometry
+from wrt.accel.queries.raw_launches import launch_raw
+from wrt.core.device import empty_aligned, launch_on, load_kernel, on_host, records, start, upload
+from wrt.core.types import Device, Kernel, WarpArray, WarpStruct
+from wrt.kernels.build import moves as kernels
 from wrt.kernels.traverse.instances import Placement
-from wrt.kernels.units.box import PAD_COORDINATE
+from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.layout import PLANES, WIDTH, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, leaf_reference
+from wrt.scene.values import MAX_REACH
 
-ROUNDOFF = 2.0**-24
-SLACK = 32.0 * ROUNDOFF  # See kernels.traverse.instances.enter.
 BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances.
-MOVED_BOXES = 1 << 18  # As BOXES, but in a move: fewer boxes take less time, and make the boxes of instances slightly larger.
-MATRICES = 1 << 17  # Boxes to transform at a time.
+MOVED_BOXES = 64  # Boxes of a part in a move: fewer boxes take less time, and make the boxes of instances slightly larger.
+INSTANCES_PER_JOB = 1024
+WRITTEN = ("placements", "low", "high", "slack", "slot_slack", "node_slack", "nodes", "wide", "pending", "invalid")  # by a move
+LARGEST = 1e300
+NONE = -1
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 
@@ -28,147 +33,137 @@ Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 class TopLevel:
     """Trees over instances."""
 
-    nodes: np.ndarray  # (N,) Bvh2Node records, one tree per world, each with its root first.
-    roots: np.ndarray  # (W,) indices of the roots.
-    parents: np.ndarray  # (N,) int32, -1 for a root.
-    order: np.ndarray  # (I,) int32, instance of each leaf.
+    data: WarpStruct  # kernels.build.moves.TopLevel on the structure's device.
+    roots: np.ndarray  # (W,) indices of the roots among the nodes.
+    order: np.ndarray  # (I,) int32, instance of each placement.
     depth: int  # Depth of the deepest tree.
-    low: np.ndarray  # (I, 3) float32, low corners of the instances' boxes.
-    high: np.ndarray  # (I, 3) float32, high corners.
-    spread: np.ndarray  # (I,), see `spread_of`.
-    placements: np.ndarray  # (I,) Placement records in the order of the leaves.
-
-    @property
-    def slack(self) -> float:
-        """Widening of boxes, as a fraction of the ray's distance (kernels.traverse.instances.enter)."""
-        return float(np.float32(SLACK * self.spread.max(initial=1.0)))
+    threads: int
 
     @property
     def cost(self) -> float:
         """Sum of the surface areas of all boxes, each divided by the area of its tree's root."""
-        areas = np.stack([half_areas(self.nodes["lo_" + side], self.nodes["hi_" + side]) for side in "01"])
-        of_root = [end(self.nodes[name + "_0"], self.nodes[name + "_1"])[self.roots]
-                   for name, end in (("lo", np.minimum), ("hi", np.maximum))]
-        whole = np.repeat(half_areas(*of_root), np.diff([*self.roots, len(self.nodes)]))
+        nodes = on_host(self.data.nodes)
+        areas = np.stack([half_areas(nodes["lo_" + side], nodes["hi_" + side]) for side in "01"])
+        of_root = [end(nodes[name + "_0"], nodes[name + "_1"])[self.roots] for name, end in (("lo", np.minimum), ("hi", np.maximum))]
+        whole = np.repeat(half_areas(*of_root), np.diff([*self.roots, len(nodes)]))
         return float((areas.sum(axis=0)[whole > 0.0] / whole[whole > 0.0]).sum())
 
+    def copied(self) -> "TopLevel":
+        """Return the trees with copies of the arrays that a move writes, and without `to_world`."""
+        out = kernels.TopLevel()
+        for name in fields_of(out):
+            value = getattr(self.data, name)
+            setattr(out, name, None if name == "to_world" else wp.clone(value) if name in WRITTEN and value is not None else value)
+        return replace(self, data=out)
 
-def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """Build the trees over the boxes of all instances."""
+    def movable(self, rows: np.ndarray, geometry: InstancedGeometry, boxes: list[Boxes]) -> "TopLevel":
+        """Return the trees with what moves need. rows: instance of each value of hits.instance; boxes: see `part_boxes`."""
+        out, device = self.copied(), self.data.nodes.device
+        origins = np.array([np.zeros(3) if part.origin is None else part.origin for part in geometry.parts])
+        out.data.rows, out.data.invalid = upload(rows, wp.int32, device), wp.zeros(len(rows), dtype=wp.int32, device=device)
+        out.data.own_origin, out.data.most_spread, out.data.reach = upload(origins, wp.vec3d, device), MAX_SPREAD, MAX_REACH
+        set_boxes(out.data, boxes, device)
+        for kernel in (kernels.place, kernels.fit):
+            load_kernel(kernel, device)
+        return out
+
+    def place(self, ids: WarpArray, transforms: WarpStruct) -> None:
+        """Write placements and boxes. ids: values of hits.instance; transforms: kernels.build.moves.Transforms. Call `fit` afterwards."""
+        launch(kernels.place, self.data, ids, transforms, threads=self.threads)
+
+    def fit(self, ids: WarpArray) -> None:
+        """Fit the trees to the instances that `place` moved."""
+        launch(kernels.fit, self.data, ids, threads=self.threads)
+
+
+def launch(kernel: Kernel, data: WarpStruct, ids: WarpArray, *inputs: WarpStruct, threads: int) -> None:
+    """Launch a kernel over `ids`, so that a graph can capture it. On the CPU, its threads share the work."""
+    device: Device = ids.device
+    if device.is_cpu and not device.is_capturing:
+        launch_raw(kernel, len(ids), data, ids, *inputs, None, threads=threads, step=INSTANCES_PER_JOB)
+    else:
+        launch_on(device, kernel, len(ids), data, ids, *inputs, None, captured=device.is_cpu)
+
+
+def transforms_of(numbers: WarpArray | np.ndarray, size: int, device: Device, outside: bool = False) -> WarpStruct:
+    """Make kernels.build.moves.Transforms of an array of float32 or float64 with one dimension. size, outside: fields of it."""
+    out = kernels.Transforms()
+    if isinstance(numbers, np.ndarray):
+        numbers = upload(numbers.reshape(-1), wp.float64, device)
+    out.floats, out.doubles = (numbers, None) if numbers.dtype == wp.float32 else (None, numbers)
+    out.size, out.outside = size, outside
+    return out
+
+
+def set_boxes(data: WarpStruct, boxes: list[Boxes], device: Device) -> None:
+    """Set the boxes of parts in a kernels.build.moves.TopLevel."""
+    data.first_box = upload(np.cumsum([0, *(len(center) for center, _ in boxes)]), wp.int32, device)
+    data.center, data.half = (upload(np.concatenate(each), wp.vec3d, device) for each in zip(*boxes, strict=True))
+
+
+def build_top(geometry: InstancedGeometry, boxes: list[Boxes], device: Device, threads: int, wide: bool) -> TopLevel:
+    """Build the trees. boxes: see `part_boxes`. wide: make the wide nodes, too."""
+    n, cpu, data = len(geometry.part), start("cpu"), kernels.TopLevel()
+    placements, everything = records(Placement, n), upload(np.arange(n), wp.int32, cpu)
+    placements["bottom"], placements["first_prim"] = geometry.part, geometry.first_prim_in_world
+    data.placements, data.rows, data.place = upload(placements, Placement, cpu), everything, everything
+    data.low, data.high = (wp.empty(n, dtype=wp.vec3, device=cpu) for _ in range(2))
+    data.slack, data.invalid = wp.empty(n, dtype=float, device=cpu), wp.empty(n, dtype=wp.int32, device=cpu)
+    data.most_spread = data.reach = np.inf
+    set_boxes(data, boxes, cpu)
+    launch(kernels.place, data, everything, transforms_of(geometry.to_world, 12, cpu), threads=threads)
+    return plant(data, geometry.first_instance, device, threads, wide)
+
+
+def plant(data: WarpStruct, first_instance: np.ndarray, device: Device, threads: int, wide: bool) -> TopLevel:
+    """Build trees over instances whose boxes and placements are known. first_instance: see InstancedGeometry."""
     from wrt.accel.bvh.top_down import build_forest  # builders are imported when they are needed: most scenes have no instances
-    from wrt.kernels.build.fit import NO_PARENT
 
-    forest, roots = build_forest("binned", low, high, geometry.first_instance, BvhOptions(max_leaf=1))
-    nodes, order = forest.nodes, forest.order
-    parents = np.full(len(nodes), NO_PARENT, np.int32)
-    for side in "01":
-        inner = np.flatnonzero((nodes["count_" + side] == 0) & (nodes["first_" + side] > 0))
-        parents[nodes["first_" + side][inner]] = inner
-    rows = np.arange(len(order))
-    top = TopLevel(nodes, roots, parents, order, forest.depth, low, high, np.empty(len(order)), records(Placement, len(order)))
-    return write_placements(top, geometry, rows)
+    low, high, place = (on_host(getattr(data, name)) for name in ("low", "high", "place"))
+    forest, roots = build_forest("binned", low, high, first_instance, BvhOptions(max_leaf=1))
+    nodes, order, count = forest.nodes, forest.order, len(forest.nodes)
+    first, size = sides(nodes, "first"), sides(nodes, "count")
+    leaf, inner = np.flatnonzero(size > 0), np.flatnonzero((size == 0) & (first > 0))
+    arrays = {"place": np.empty(len(order), np.int32), "slot": np.empty(len(order), np.int32), "up": np.full(count, NONE, np.int32),
+              "slot_slack": np.zeros(2 * count, np.float32), "node_slack": np.zeros(count, np.float32), "nodes": nodes,
+              "pending": np.bincount(np.concatenate([leaf, inner]) // 2, minlength=count).astype(np.int32),
+              "placements": on_host(data.placements)[place[order]], "low": low, "high": high, "slack": on_host(data.slack)}
+    arrays["place"][order] = np.arange(len(order))
+    arrays["slot"][order[first[leaf]]], arrays["up"][first[inner]] = leaf, inner
+    if wide:
+        arrays |= widen(nodes, roots)
+    cpu, out = start("cpu"), kernels.TopLevel()
+    for name, kind in fields_of(out).items():
+        given = getattr(data, name)
+        if name in arrays:
+            setattr(out, name, upload(arrays[name], kind.dtype, cpu))
+        elif isinstance(given, wp.array) and name not in ("wide", "wide_slot", "wide_node", "to_world", "rows"):
+            setattr(out, name, given.to(cpu))
+    out.rows = every = upload(np.arange(len(order)), wp.int32, cpu)
+    launch(kernels.fit, out, every, threads=threads)
+    out.rows, out.origin, out.most_spread, out.reach = data.rows, data.origin, data.most_spread, data.reach
+    for name in fields_of(out) if device.is_cuda else ():
+        array = getattr(out, name)
+        if isinstance(array, wp.array):
+            setattr(out, name, upload(on_host(array), array.dtype, device))
+    return TopLevel(out, roots, order, forest.depth, threads)
 
 
-def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
-    """Return `top` with the placements and spreads of the instances `rows` computed anew from `geometry`."""
-    place = np.empty(len(top.order), np.int64)
-    place[top.order] = np.arange(len(top.order))
-    placements, spread = top.placements.copy(), top.spread.copy()
-    to_local = inverse_of(geometry.to_world[rows])
-    spread[rows] = spread_of(geometry.to_world[rows], to_local)
-    out = placements[place[rows]]
-    out["bottom"], out["first_prim"] = geometry.part[rows], geometry.first_prim_in_world[rows]
-    out["local_x"], out["local_y"], out["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
-    placements[place[rows]] = out
-    return replace(top, placements=placements, spread=spread)
+def part_boxes(geometry: InstancedGeometry, bottoms: list[OneMesh], groups: int) -> list[Boxes]:
+    """Return boxes around groups of each part's primitives, about `groups` per part.
 
-
-def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """Return the trees refitted to instances that moved; the topology stays.
-
-    geometry: already has the new matrices. rows: (R,) indices of the moved instances, without repeats. low, high: (R, 3) float32, the
-    new boxes of these instances in world space.
+    bottoms: the parts' structures, whose order puts near primitives next to each other. A box around the mesh is not enough for the box
+    of an instance: a hit may lie anywhere in its primitive's padded box, which extends beyond the mesh.
     """
-    from wrt.accel.bvh.refit import Fitting, tree_of
-
-    cpu, fitting = start("cpu"), Fitting(start("cpu"), len(top.order), len(top.nodes))
-    all_low, all_high = top.low.copy(), top.high.copy()
-    all_low[rows], all_high[rows] = low, high
-    fitting.low, fitting.high = upload(all_low, wp.vec3, cpu), upload(all_high, wp.vec3, cpu)
-    tree = tree_of(fitting, upload(top.nodes.copy(), Bvh2Node, cpu), upload(top.parents, wp.int32, cpu),
-                   upload(top.order, wp.int32, cpu))
-    fitting.fit(tree)
-    return write_placements(replace(top, nodes=on_host(tree.nodes), low=all_low, high=all_high), geometry, rows)
-
-
-def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a box of each instance in `rows` around the transformed boxes of its primitives: low and high (R, 3) float32.
-
-    A box around the transformed mesh is not enough: a hit may lie anywhere in its primitive's padded box, which extends beyond the mesh.
-    boxes: from `part_boxes`.
-    """
-    lo, hi = np.full((len(rows), 3), np.inf, np.float32), np.full((len(rows), 3), -np.inf, np.float32)
-    for index, (center, half) in enumerate(boxes):
-        chosen = np.flatnonzero(geometry.part[rows] == index) if len(center) else np.zeros(0, np.int64)
-        step = max(MATRICES // max(len(center), 1), 1)
-        for some in (chosen[first : first + step] for first in range(0, len(chosen), step)):
-            linear, offset = geometry.to_world[rows[some], :, :3].transpose(0, 2, 1), geometry.to_world[rows[some], None, :, 3]
-            middle, reach = center @ linear + offset, half @ np.abs(linear)
-            lo[some], hi[some] = rounded_out((middle - reach).min(axis=1), (middle + reach).max(axis=1))
-    return lo, hi
-
-
-def part_boxes(geometry: InstancedGeometry, orders: list[np.ndarray], most: int) -> list[Boxes]:
-    """Return boxes around groups of each part's primitives: about `most` boxes over all instances, at least 8 per part.
-
-    orders: prim_ids of each part, in an order that puts near primitives next to each other.
-    """
-    groups = max(most // max(len(geometry.part), 1), 8)
-    corners = [grouped_boxes(part, order, groups) for part, order in zip(geometry.parts, orders, strict=True)]
-    return [(0.5 * (low + high), 0.5 * (high - low)) for low, high in corners]
-
-
-def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about `groups` boxes that contain the boxes of all primitives: low and high (G, 3) float64. order: see `part_boxes`."""
-    low, high = (corner.astype(np.float64) for corner in geometry.bounds())
-    if len(low) <= groups:
-        return low, high
-    first = np.arange(0, len(order), -(-len(order) // groups))
-    return np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
-
-
-def rounded_out(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round corners of boxes outwards to float32, with a margin for the rounding of a ray origin's coordinates."""
-    pad = 2.0 * PAD_COORDINATE * np.maximum(np.abs(low), np.abs(high))
-    return np.nextafter((low - pad).astype(np.float32), np.float32(-np.inf)), \
-        np.nextafter((high + pad).astype(np.float32), np.float32(np.inf))
-
-
-NONE = -1
-
-
-@dataclass(frozen=True, eq=False)
-class WideTop:
-    """Topology of the wide trees over a list of binary trees, without boxes."""
-
-    children: np.ndarray  # (N, 8) int32 references; a leaf is one placement.
-    source: np.ndarray  # (N, 8), box of each child as 2 * binary node + side, or -1.
-    roots: np.ndarray  # (W,) int32, root of each tree.
-
-    def nodes(self, binary: np.ndarray) -> np.ndarray:
-        """Return the nodes in the layout of kernels.wide.nodes, with the boxes of the binary nodes (Bvh2Node records).
-
-        The row behind the references begins with the low and the high corner of the box around all children (instances.h: widening).
-        """
-        first = first_reference(WIDTH, False)
-        out = empty_aligned((len(self.children), node_size(WIDTH, False)), np.float32)
-        out[:, first + WIDTH + 6 :] = 0.0
-        out[:, first : first + WIDTH] = self.children.view(np.float32)
-        planes, exists = out[:, :first].reshape(-1, len(PLANES), WIDTH), (self.children != EMPTY)[:, None]
-        for end, (name, empty, around) in enumerate((("lo", np.inf, np.min), ("hi", -np.inf, np.max))):
-            planes[:, end::2] = np.where(exists, sides(binary, name)[self.source].transpose(0, 2, 1), empty)
-            out[:, first + WIDTH + 3 * end :][:, :3] = np.where(exists.any(axis=2), around(planes[:, end::2], axis=2), 0.0)
-        return out.reshape(-1)
+    out = []
+    for part, bottom in zip(geometry.parts, bottoms, strict=True):
+        order = bottom.built.order
+        low, high = (np.clip(corner, -LARGEST, LARGEST, dtype=np.float64) for corner in part.bounds())  # the box of all space is infinite
+        if len(low) > groups:
+            first = np.arange(0, len(order), -(-len(order) // groups))
+            low, high = np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
+        out.append((0.5 * (low + high), 0.5 * (high - low)))
+    return out
 
 
 def sides(binary: np.ndarray, name: str) -> np.ndarray:
@@ -176,11 +171,17 @@ def sides(binary: np.ndarray, name: str) -> np.ndarray:
     return np.stack([binary[name + "_0"], binary[name + "_1"]], axis=1).reshape(2 * len(binary), *binary[name + "_0"].shape[1:])
 
 
-def widen(binary: np.ndarray, roots: np.ndarray) -> WideTop:
-    """Make wide trees: a node takes the place of its largest child, by area, until it has eight children or only leaves."""
-    low, high, first, count = (sides(binary, name) for name in ("lo", "hi", "first", "count"))
-    exists, area = np.asarray((low <= high).all(axis=1)), half_areas(low, high)
-    level, references, sources, made = roots.astype(np.int64), [], [], 0
+def widen(binary: np.ndarray, roots: np.ndarray) -> dict[str, np.ndarray]:
+    """Make wide trees, in the layout of kernels.wide.nodes, without boxes. Return the fields wide, wide_slot and wide_node of
+    kernels.build.moves.TopLevel. The trees' roots come first.
+
+    A node takes the place of its largest child, by area, until it has eight children or only leaves. The row behind the references has
+    the box around all children and the largest slack (instances.h: widening).
+    """
+    first, count, area = sides(binary, "first"), sides(binary, "count"), half_areas(sides(binary, "lo"), sides(binary, "hi"))
+    exists, at, size = (count > 0) | (first > 0), first_reference(WIDTH, False), node_size(WIDTH, False)
+    level, rows, made = roots.astype(np.int64), [], 0
+    wide_slot, wide_node = np.full(2 * len(binary), NONE, np.int32), np.full(len(binary), NONE, np.int32)
     while len(level):
         code = np.full((len(level), WIDTH), NONE)
         code[:, 0], code[:, 1] = 2 * level, 2 * level + 1
@@ -192,11 +193,16 @@ def widen(binary: np.ndarray, roots: np.ndarray) -> WideTop:
             code[row, largest[row]], code[row, slot] = 2 * child, 2 * child + 1
         code[~exists[code]] = NONE
         leaf, inner = (code != NONE) & (count[code] > 0), (code != NONE) & (count[code] == 0)
+        index = made + np.arange(len(level))
         made += len(level)
-        children = np.full(code.shape, EMPTY, np.int64)
+        wide_node[level] = size * index + at + WIDTH
+        wide_slot[code[leaf | inner]] = (size * index[:, None] + np.arange(WIDTH))[leaf | inner]
+        children = np.full(code.shape, EMPTY, np.int32)
         children[leaf] = leaf_reference.func(first[code[leaf]].astype(np.int64), 1)
         children[inner] = made + np.arange(inner.sum())
-        references.append(children)
-        sources.append(code)
+        rows.append(children)
         level = first[code[inner]].astype(np.int64)
-    return WideTop(np.concatenate(references).astype(np.int32), np.concatenate(sources), np.arange(len(roots), dtype=np.int32))
+    wide = empty_aligned((made, size), np.float32)
+    wide[:, :at].reshape(-1, len(PLANES), WIDTH)[:, ::2], wide[:, :at].reshape(-1, len(PLANES), WIDTH)[:, 1::2] = np.inf, -np.inf
+    wide[:, at : at + WIDTH], wide[:, at + WIDTH :] = np.concatenate(rows).view(np.float32), 0.0
+    return {"wide": wide.reshape(-1), "wide_slot": wide_slot, "wide_node": wide_node}

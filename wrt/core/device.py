@@ -278,14 +278,15 @@ def launch(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int 
     launch_on(start("cpu"), kernel, n, *inputs, threads=threads, step=step)
 
 
-def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
-    """Launch a kernel over n elements.
+def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0, captured: bool = False) -> None:
+    """Launch a kernel over n elements. captured: a graph of the CPU may capture the launch.
 
     With a step, the CPU launches the kernel once for each range of `step` elements, on `threads` threads. An input of None is replaced
     by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.settings.block_dim threads."""
     if n == 0:
         return
-    warp_private.refuse_capture()
+    if not captured:
+        warp_private.refuse_capture()
     load_kernel(kernel, device)
     step = step if step and device.is_cpu else n
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+import wrt
+from tests.data import ROOT
+from tests.kernel_tools import cpu_only
 from tests.placed import place
 from tests.refused import Refusal, refused
 from tests.wrt.accel.queries.test_threads import at_a_time
-from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry, inverse_of
 from wrt.accel.instances import Instances
+from wrt.accel.queries.all_hits import all_hits, count_hits
 from wrt.accel.scenes.build import build
+from wrt.core.device import on_host
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
@@ -244,3 +250,153 @@ def test_an_object_that_was_read_from_a_file_has_the_files_name() -> None:
         accel.move(object=name, matrix=matrix)
         hits = accel.closest_hit([[matrix[0, 3], 0.0, 5.0]], [[0.0, 0.0, -1.0]])
         assert hits.instance[0] == instance
+
+
+# --- moves in place ---------------------------------------------------------------------------------------------------
+
+ROWS = ("transformf", "mat44f", "rows of 3", "float64")
+
+
+def in_rows(poses: np.ndarray, kind: str, device: Any) -> wp.array:
+    """Return matrices (R, 4, 4) as a Warp array; of `transformf` only rotations and translations."""
+    if kind == "transformf":
+        turned = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        return wp.array(np.concatenate([poses[:, :3, 3], turned], axis=1), dtype=wp.transformf, device=device)
+    if kind == "mat44f":
+        return wp.array(poses, dtype=wp.mat44f, device=device)
+    return wp.array(poses[:, :3] if kind == "rows of 3" else poses, dtype=float if kind == "rows of 3" else wp.float64, device=device)
+
+
+def worlds_of(kind: str, worlds: int = 5) -> Instances:
+    grey, meshes = (Material(),), (icosphere(2), torus(segments=12, tube_segments=8))
+    scenes = [Scene(tuple(Object(meshes[(k + world) % 2], grey) for k in range(2 + world))) for world in range(worlds)]
+    accel = build(scenes, kind)
+    assert isinstance(accel, Instances)
+    return accel
+
+
+def lists_and_hits(accel: Any, worlds: int) -> list[bytes]:
+    origins, directions = rays(2000)
+    some = {"world": np.arange(2000) % worlds} if worlds > 1 else {}
+    hits, lists = accel.closest_hit(origins, directions, **some), all_hits(accel, origins, directions, **some)
+    assert (hits.prim_id >= 0).mean() > 0.05 and len(lists.t) > 100
+    found = [hits.t, hits.u, hits.v, hits.prim_id, hits.point, hits.normal, hits.instance, accel.any_hit(origins, directions, **some),
+             count_hits(accel, origins, directions, **some), lists.t, lists.prim_id, lists.instance]
+    return [np.asarray(each).tobytes() for each in found]
+
+
+@pytest.mark.parametrize("rows", ROWS)
+@pytest.mark.parametrize("kind", ["bvh2", "bvh8"])
+def test_moves_in_place_have_the_hits_of_a_new_structure(kind: str, rows: str) -> None:
+    for accel, worlds in ((structure(kind), 1), (worlds_of(kind), 5)):
+        n = len(cast(Any, accel.geometry).part)
+        poses = matrices(n, 5)
+        if rows == "transformf":
+            poses[:, :3, :3] = Rotation.random(n, random_state=5).as_matrix()
+        elif rows == "float64":
+            poses[:, :3, :3] @= np.random.default_rng(1).uniform(-1.0, 1.0, (n, 3, 3)) + 2.0 * np.eye(3)  # sheared
+        given = in_rows(poses, rows, accel.device)
+        assert np.isnan(accel.move(given).growth)
+        data = accel.data
+        for some in (range(n), [3, 1], [n - 1]):
+            accel.move(wp.array(some, dtype=wp.int32, device=accel.device), in_rows(poses[list(some)], rows, accel.device))
+            geometry = cast(Any, accel.geometry)
+            np.testing.assert_allclose(geometry.to_world, poses[:, :3], atol=1e-5)
+            assert lists_and_hits(accel, worlds) == lists_and_hits(Instances.restore(
+                accel.bottoms, geometry.now(), accel.snapshot.attributes, str(accel.device), None), worlds)
+            poses[0, :3, 3] += 1.0
+            accel.move(wp.array([0], dtype=wp.int32, device=accel.device), in_rows(poses[:1], rows, accel.device))
+        assert accel.data is data and not accel.invalid_moves.numpy().any()
+        before = lists_and_hits(accel, worlds)
+        assert lists_and_hits(pickle.loads(pickle.dumps(accel)), worlds) == before
+        accel.move(accel.geometry.to_world)  # type: ignore[union-attr]  # not in place, from NumPy
+        assert accel.data is not data and lists_and_hits(accel, worlds) == before
+
+
+def test_an_invalid_move_in_place_hides_the_instance_until_it_moves_again() -> None:
+    accel, poses = structure("bvh8"), np.float32(matrices(24, 6))
+    everything = range(24)
+    accel.move(in_rows(poses, "mat44f", accel.device))
+    whole = answers(accel)
+    bad = poses.copy()
+    bad[2, 0, 3], bad[5, 1, 1], bad[7, :3, :3], bad[8, 2, 3], bad[9, :3, :2] = np.nan, np.inf, 0.0, 1e19, poses[9, :3, 1:3]
+    given = in_rows(bad, "mat44f", accel.device)
+    with refused("matrix", "matrix of instance 2"):
+        accel.move(given, check=True)
+    assert answers(accel) == whole
+    accel.move(given)
+    assert {i: int(code) for i, code in enumerate(accel.invalid_moves.numpy()) if code} == dict.fromkeys((2, 5, 7, 8, 9), 1)
+    assert not {2, 5, 7, 8, 9} & set(accel.closest_hit(*rays()).instance) and np.isfinite(cast(Any, accel.geometry).to_world).all()
+    accel.move(wp.array([99, -1, 9], dtype=wp.int32, device=accel.device), in_rows(poses[[0, 1, 9]], "mat44f", accel.device))
+    accel.move(0, poses[0], rebuild_at=0.0)  # a new tree keeps the hidden instances
+    assert set(accel.closest_hit(*rays()).instance) >= {*everything} - {2, 5, 7, 8} and answers(accel) != whole
+    accel.move(in_rows(poses, "mat44f", accel.device))
+    assert answers(accel) == whole and not accel.invalid_moves.numpy().any()
+
+
+@pytest.mark.parametrize("ids, given, told", [
+    (None, lambda poses: wp.array(poses[:3], dtype=wp.mat44f), ("matrix", "(24,) of transformf or mat44f")),
+    (None, lambda poses: wp.array(poses, dtype=wp.mat44h), ("matrix", "of transformf or mat44f")),
+    (None, lambda poses: wp.array(poses[:, 0, :3], dtype=wp.vec3), ("matrix", "of transformf or mat44f")),
+    (None, lambda poses: wp.array(np.tile(poses, (2, 1, 1)), dtype=wp.mat44f)[::2], ("matrix", "must be contiguous")),
+    (np.float32([0.0]), lambda poses: wp.array(poses[:1], dtype=wp.mat44f), ("instance", "(R,) of int32")),
+    (np.int64([0]), lambda poses: wp.array(poses[:1], dtype=wp.mat44f), ("instance", "(R,) of int32")),
+    (np.int32([0, 1]), lambda poses: wp.array(poses[:1], dtype=wp.mat44f), ("matrix", "(2,) of transformf")),
+    (np.int32([0, 24]), lambda poses: wp.array(poses[:2], dtype=wp.mat44f), ("instance", "0 to 23, got 24")),
+    (np.int32([3, 3]), lambda poses: wp.array(poses[:2], dtype=wp.mat44f), ("instance", "same index twice")),
+])
+def test_arrays_that_a_move_in_place_refuses(ids: np.ndarray | None, given: Callable[[np.ndarray], wp.array], told: Refusal) -> None:
+    accel, poses = structure(), np.float32(matrices(24, 6))
+    with wp.ScopedDevice(accel.device):
+        accel.move(in_rows(poses, "mat44f", accel.device))
+        before = answers(accel)
+        with refused(*told):
+            accel.move(*([] if ids is None else [wp.array(ids)]), given(matrices(24, 7)), check=True)
+        with refused("rebuild_at"):
+            accel.move(given(poses), rebuild_at=2.0)
+    assert answers(accel) == before
+
+
+@cpu_only
+def test_a_graph_of_the_cpu_captures_a_move_in_place() -> None:
+    accel, poses = worlds_of("bvh8"), in_rows(np.tile(np.eye(4), (20, 1, 1)), "transformf", "cpu")
+    origins, directions = (wp.array(each, dtype=wp.vec3, device="cpu") for each in rays(500))
+    t, query = wp.zeros(500, dtype=float, device="cpu"), wrt.ray_query(accel)
+
+    @wrt.kernel
+    def trace(world: query.World, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t: wp.array(dtype=float)):  # type: ignore
+        i = wp.tid()
+        ray = query.ray(origins[i], directions[i])
+        ray.world = i % 5
+        t[i] = query.closest_hit(world, ray).t
+
+    with refused(None, "the first move in place"), wp.ScopedCapture("cpu"):
+        accel.move(poses)
+    accel.move(poses)
+    with wp.ScopedCapture("cpu") as capture:
+        accel.move(poses)
+        wp.launch(trace, 500, [accel.world, origins, directions, t], device="cpu")
+    seen = set()
+    for seed in (1, 2):
+        poses.numpy()[:, :3] = np.random.default_rng(seed).normal(scale=2.0, size=(20, 3))
+        wp.capture_launch(capture.graph)
+        expected = worlds_of("bvh8")
+        expected.move(np.arange(20), cast(Any, accel.geometry).to_world)
+        assert np.array_equal(t.numpy(), expected.closest_hit(*rays(500), world=np.arange(500) % 5).t)
+        seen.add(t.numpy().tobytes())
+    assert len(seen) == 2
+
+
+def test_placements_have_the_bits_of_inverse_of() -> None:
+    geometry = crowd(200)
+    accel = structure(geometry=geometry)
+    placed = on_host(accel.data.placements)
+    rows = np.stack([placed[f"local_{axis}"] for axis in "xyz"], axis=1)
+    assert np.array_equal(rows, inverse_of(geometry.to_world)[accel.snapshot.order])
+
+
+def test_the_example_in_the_documentation() -> None:
+    page = (ROOT / "docs/moving.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {"wrt": wrt, "scene": Scene.of([icosphere(1), torus()])}
+    exec(page[page.index("**Moving in place.**") :].split("```python\n")[1].split("```")[0], names)
+    assert np.array_equal(names["worlds"].geometry.to_world, np.tile(np.c_[np.eye(3), [0.0, 0.0, 1.0]], (128, 1, 1)))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from ctypes import c_float
-from functools import cache, lru_cache
+from functools import lru_cache
 from math import copysign
 from typing import Any, NamedTuple
 
@@ -120,20 +120,18 @@ def host_arrays(rays: Rays) -> Rays:
     return Rays(*map(np.asarray, rays.on(wp.get_device("cpu")).checked()))
 
 
+_ends: dict[tuple[float, str], WarpArray] = {}  # usual t_min and t_max, which all calls share: an array takes longer to make than a launch
+
+
 def constant_array(value: float, n: int, device: Device) -> WarpArray:
     """Return an array (n,) of stride 0, all of whose elements are `value`. A CUDA graph can capture this call."""
-    known = value in (0.0, np.inf) and device.is_cuda and not device.is_capturing
-    one = default_end(abs(value), device.alias) if known else wp.full(1, value, dtype=wp.float32, device=device)
+    key = value + 0.0, device.alias  # 0.0 for -0.0
+    if key not in _ends and key[0] in (0.0, np.inf) and device.is_cuda and not device.is_capturing:
+        _ends[key] = wp.full(1, value, dtype=wp.float32, device=device)
+        wp.synchronize_device(device)  # other streams read it, too
+    one = _ends[key] if key in _ends else wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
     keep(out, one)
-    return out
-
-
-@cache
-def default_end(value: float, device: str) -> WarpArray:
-    """Return an array (1,) of a usual t_min or t_max, which all calls share: an array takes longer to make than a launch."""
-    out = wp.full(1, value, dtype=wp.float32, device=device)
-    wp.synchronize_device(device)  # other streams read it, too
     return out
 
 
