@@ -16,7 +16,6 @@ from wrt.kernels.traverse.planes import STACK_SIZE
 
 DEFERRED = wp.constant(-1)  # `axis` of a node that a later launch builds; `first` is the index of its cell in CellOutput.deferred
 OCTANTS = wp.constant(5)  # `axis` of the node of an octree's cell; `count` is the mask of its octants
-MAX_PARTS = 8
 
 
 @wp.struct

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from wrt.scene.settings import SettingChanges
 
 
-
 @click.command(help=f"Render SCENE to a picture. SCENE is .toml, .gltf, .glb, or a mesh: {SUFFIXES}.")
 @shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),

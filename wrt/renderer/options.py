@@ -109,12 +109,12 @@ class Options:
         self.aov = as_names(self.aov, "aov")
         for name in self.aov:
             require_known(name, AOVS, "AOV", "aov")
-        for name in ("time_limit", "target_error", "checkpoint_every"):
-            value = as_one(getattr(self, name), (int, float, np.number, type(None)), name)
+        for name in ("time_limit", "target_error", "checkpoint_every"):  # None is valid where it is the default
+            value = as_one(getattr(self, name), (int, float, np.number, type(getattr(Options, name))), name)
             if value is not None and not 0.0 < float(value) < math.inf:
                 raise InputError(f"must be more than 0 and finite, got {value}", argument=name)
         for name, (low, high) in WHOLE.items():
-            if getattr(self, name) is not None:
+            if getattr(self, name) is not None or getattr(Options, name) is not None:
                 setattr(self, name, as_integer(getattr(self, name), name, low, high))
         self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
         if as_one(self.resume, bool, "resume") and self.checkpoint is None:
@@ -127,7 +127,6 @@ class Options:
             raise InputError(f"must be a function that takes a Progress, got {shown(self.progress)}", argument="progress")
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")
         as_one(self.accel_options, dict, "accel_options")
-        as_one(self.threads, (int, np.integer, type(None)), "threads")
         thread_count(self.threads)
         self._check_devices()
 

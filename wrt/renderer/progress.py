@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING
 
 from wrt.core.compiling import COMPILING
@@ -61,29 +61,34 @@ def _bar() -> Iterator[Callable[[Progress], None]]:
         from rich.progress import Progress as RichProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    with RichProgress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("render", total=None, note="")
+    bar = RichProgress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("render", total=None, note="")
 
-        def report(progress: Progress) -> None:
-            if progress.stage == "compile":
-                bar.update(task, description=COMPILING)
-                return
-            building = progress.stage == "build"
-            bar.update(task, completed=progress.done, total=progress.total, note="" if building else describe(progress),
-                       description=BUILDING if building else "render")
+    def report(progress: Progress) -> None:
+        if progress.stage == "compile":
+            bar.update(task, description=COMPILING)
+            return
+        what, note = (BUILDING, "") if progress.stage == "build" else ("render", describe(progress))
+        bar.update(task, description=what, completed=progress.done, total=progress.total, note=note)
 
+    bar.start()
+    try:
         yield report
+    finally:
+        with suppress(OSError):  # a closed terminal (SIGHUP) must not end the render before its picture is saved
+            bar.stop()
 
 
 def _lines() -> Callable[[Progress], None]:
     due = {"build": LINE_EVERY, "trace": LINE_EVERY}
 
     def report(progress: Progress) -> None:
-        if progress.stage == "compile":
-            print(COMPILING, file=sys.stderr, flush=True)
-        elif progress.seconds >= due[progress.stage]:
-            due[progress.stage] = progress.seconds + LINE_EVERY
-            text = BUILDING if progress.stage == "build" else describe(progress)
-            print(f"{100.0 * progress.done / progress.total:.0f} %, {text}", file=sys.stderr, flush=True)
+        with suppress(OSError):  # of a pipe whose reader has ended
+            if progress.stage == "compile":
+                print(COMPILING, file=sys.stderr, flush=True)
+            elif progress.seconds >= due[progress.stage]:
+                due[progress.stage] = progress.seconds + LINE_EVERY
+                text = BUILDING if progress.stage == "build" else describe(progress)
+                print(f"{100.0 * progress.done / progress.total:.0f} %, {text}", file=sys.stderr, flush=True)
 
     return report

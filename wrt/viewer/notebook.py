@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from IPython.display import DisplayHandle
     from PIL import Image
 
-
 SHARE = 0.1  # largest share of the time that may go into showing pictures
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -40,6 +42,23 @@ def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytes
     assert reported == [int(second // LINE_EVERY) for second in range(35)]
     assert set(stderr.getvalue().splitlines()[0]) & set("\x1b\r") == set()
     assert stderr.getvalue().startswith("25 %, 4.0 Mray/s, 0:30 left\n")
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo terminals")
+def test_a_terminal_that_closes_does_not_end_a_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After SIGHUP, the picture so far is saved when the bar has ended."""
+    monkeypatch.setenv("TERM", "xterm")
+    main, terminal = os.openpty()
+    ended = False
+    with suppress(OSError), open(terminal, "w") as stderr:  # closing stderr fails, too
+        monkeypatch.setattr(sys, "stderr", stderr)
+        with progress_reporter(False) as report:
+            assert report is not None
+            report(at(10.0))
+            os.close(main)
+            report(at(20.0))
+        ended = True
+    assert ended
 
 
 def test_a_short_render_shows_no_bar_where_stderr_is_no_terminal(tmp_path: Path) -> None:

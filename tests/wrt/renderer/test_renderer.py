@@ -293,12 +293,13 @@ def test_renders_in_other_threads(reference: Film) -> None:
     ({"threads": 0}, ("threads", "must be 1 to")),
     ({"seed": 2**32}, ("seed",)), ({"seed": 0.5}, ("seed", "whole number")), ({"tile_size": 0}, ("tile_size",)),
     ({"time_limit": 0.0}, ("time_limit", "more than 0")), ({"target_error": float("nan")}, ("target_error",)),
-    ({"checkpoint_every": "30s"}, ("checkpoint_every",)), ({"camera": "nope"}, ("camera", "no camera 'nope'")),
+    ({"checkpoint_every": "30s"}, ("checkpoint_every",)), ({"checkpoint_every": None}, ("checkpoint_every",)), ({"seed": None}, ("seed",)),
+    ({"camera": "nope"}, ("camera", "no camera 'nope'")),
     ({"spp": 0}, ("spp", "1")), ({"size": (100000, 100000)}, ("size", "1x1 to 32768x32768")), ({"size": "32*18"}, ("size", "two whole")),
     ({"max_depth": 65}, ("max_depth",)), ({"filter": "nope"}, ("filter", "must be one")),
     *(({"crop": crop}, ("crop", "within the picture")) for crop in ((0, 0, 38, 22), (-1, 0, 5, 5), (5, 5, 5, 6))),
     ({"crop": (0, 0, 4)}, ("crop", "x0, y0, x1, y1")), ({"sp": 4}, ("sp", "unknown argument", None, None, "'spp'")),
-    ({"threads": "two"}, ("threads", "int")), ({"progress": True}, ("progress", "function")), ({"accel": None}, ("accel", "str")),
+    ({"threads": "two"}, ("threads", "whole number")), ({"progress": True}, ("progress", "function")), ({"accel": None}, ("accel", "str")),
     ({"aov": 3}, ("aov", "one or more names")), ({"accel_options": []}, ("accel_options", "dict")),
 ], ids=str)
 def test_the_error_names_the_wrong_argument(options: dict[str, Any], message: Refusal) -> None:

@@ -176,6 +176,8 @@ class ListQuery:
                 self.touches[some] = counts < 0
                 counts = np.maximum(counts, 0)
             out[i] = take(lists, firsts[i], counts.astype(np.int64))
+            if self.device.is_cpu:
+                lists.release()
 
         if self.device.is_cpu:
             free = host_lists(self.snapshot.structure)

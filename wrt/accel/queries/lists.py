@@ -65,7 +65,7 @@ class HostLists:
         self.index = np.arange(BATCH + 1, dtype=np.int32)
         self.room, self.first = FEW, FEW * self.index
         self.counts, self.root, to_face, self.begin = np.empty((4, BATCH), np.int32)
-        self.rows, self.out = self._rows(FEW * BATCH), [np.empty(FEW * BATCH, wp.dtype_to_numpy(kind)) for kind in HIT_KINDS]
+        self.rows, self.out = np.empty(FEW * BATCH, row_type(Hit)), [np.empty(FEW * BATCH, wp.dtype_to_numpy(kind)) for kind in HIT_KINDS]
         self.place = self.root, np.empty(BATCH, np.float64), to_face, np.empty(BATCH, np.float32)
         self.given, self.packed = struct_record(RayArrays, self.rays), struct_record(HitArrays, self.out)
         # The second lists are for rays with more hits than the first lists hold.
@@ -76,10 +76,6 @@ class HostLists:
         self.copier.set(0, self.given)
         self.filler: RawLaunch | None = None
         self.worker: Worker | None = None
-
-    @staticmethod
-    def _rows(n: int) -> np.ndarray:
-        return np.empty(n, row_type(Hit))
 
     def find(self, snapshot: Snapshot, rays: Sequence[np.ndarray], roots: np.ndarray | None, limit: int, mesh: Mesh,
              counting: bool) -> np.ndarray:
@@ -115,7 +111,7 @@ class HostLists:
         """Fill the second lists for the rays with more hits than the first lists hold, and return all counts."""
         many = counts > self.room
         first = begins(np.where(many, np.minimum(counts, 2 * limit), 0))
-        self.kept = first.astype(np.int32), np.zeros(len(counts), np.int32), self._rows(rows_of(first[-1]))
+        self.kept = first.astype(np.int32), np.zeros(len(counts), np.int32), np.empty(rows_of(first[-1]), row_type(Hit))
         for name in ("limit", "crossings", "vertices", "faces", "first_face"):
             setattr(self.more, name, getattr(self.lists, name))
         self.more.first, self.more.count, self.more.rows = map(array_record, self.kept)
@@ -133,7 +129,7 @@ class HostLists:
         self.filler.launch()
 
     def copy(self, begin: np.ndarray, hits: Any) -> None:
-        """Copy the list of ray i to `hits`, a record of HitArrays, from begin[i] on, and give the second lists' memory back."""
+        """Copy the list of ray i to `hits`, a record of HitArrays, from begin[i] on."""
         n = len(begin)
         self.begin[:n] = begin
         self.copier.set(2, array_record(self.begin))
@@ -142,7 +138,6 @@ class HostLists:
         for lists in (self.lists, self.more) if self.kept else (self.lists,):
             self.copier.set(1, lists)
             self.copier.launch()
-        self.kept = ()
 
     def hits(self, counts: np.ndarray) -> list[np.ndarray]:
         """Return t, u, v and prim_id of all hits, one list after another. counts: (n,), lengths of the lists."""
@@ -153,6 +148,10 @@ class HostLists:
             packed = struct_record(HitArrays, out)
         self.copy(first[:-1], packed)
         return out if out is not self.out else [array[:total].copy() for array in out]
+
+    def release(self) -> None:
+        """Give the second lists' memory back."""
+        self.kept = ()
 
 
 @made_once

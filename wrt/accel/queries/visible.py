@@ -18,7 +18,7 @@ from wrt.accel.queries.arguments import check_world, in_shape, indices_of, pairs
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import Rays, filled, from_origin, to_origin, vectors
-from wrt.core.arrays import check_no_gradients, to_numpy, to_tensor_like
+from wrt.core.arrays import check_no_gradients, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
@@ -89,8 +89,8 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
         surfaces = device_scene(snapshot).surfaces
-        ids = [to_numpy(indices_of(-1 if value is None else value, shape, name, -1, len(snapshot.geometry)))
-               for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
+        ids = [indices_of(real_numbers(-1 if value is None else value, name, f"{shape} prim_ids"), shape, name, -1, len(snapshot.geometry))
+               for value, name in ((on_a, "on_a"), (on_b, "on_b"))]  # checked on the host, because kernels read primitives by them
 
     def run(kernel: Kernel, *inputs: object) -> None:
         launch_on(device, kernel, n, *inputs, None, threads=threads, step=PAIRS_PER_LAUNCH)

@@ -219,7 +219,7 @@ class Materials:
                 if field in _SWITCHES and value == 0.0:
                     break
                 fields[field] = self._textures.texture(value, SLOTS[field], name, f"{where}.{key}") if field in SLOTS else value
-            if getattr(values, "clearcoatNormalTexture", None) is not None:
+            if "clearcoat" in fields and getattr(values, "clearcoatNormalTexture", None) is not None:
                 self._document.left_out.add("clearcoatNormalTexture", "material", name)
         return fields
 

@@ -17,7 +17,6 @@ TAN_HALF_FOV = 0.55  # a field of view of 58 degrees
 POINTS_OF_RAYS = 50  # rays for each point: trimesh takes milliseconds a point
 TILE = 64  # pixels of a side of a picture in a small world
 OFFSET = 1e-4  # start of shadow and diffuse rays above the surface, over the radius of the mesh's bounding sphere
-TIMES = 1000.0  # size of a stadium over that of the mesh in it
 BALLS = 10  # in a small world
 
 
@@ -192,12 +191,12 @@ def stands(tiers: int = 50, seats: int = 400) -> Mesh:
                 np.concatenate([faces, last + np.array([[0, 1, 2], [0, 2, 3]])]).astype(np.int32), name="stadium")
 
 
-def in_stadium(mesh: Mesh, times: float = TIMES) -> Mesh:
-    """Return the mesh on the pitch of a stadium that is `times` as large; the mesh's faces come first. No single cell size of a uniform
+def in_stadium(mesh: Mesh) -> Mesh:
+    """Return the mesh on the pitch of a stadium that is 1000 times as large; the mesh's faces come first. No single cell size of a uniform
     grid suits both (Haines 1988, "Spline Surface Rendering, and What's Wrong with Octrees", Ray Tracing News 1(2))."""
     lo, hi = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     around = stands()
-    scale = times * 0.5 * float(np.linalg.norm(hi - lo))
+    scale = 500.0 * float(np.linalg.norm(hi - lo))
     place = np.array([0.5 * (lo[0] + hi[0]), lo[1], 0.5 * (lo[2] + hi[2])])
     return merged([mesh, Mesh(around.vertices * scale + place, around.faces)], f"{mesh.name} in a stadium")
 

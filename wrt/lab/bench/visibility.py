@@ -44,11 +44,11 @@ run by run. cast / raster: above 1 rasterising is faster. differ: pixels whose p
 within {SAME_DEPTH:g} relative; at the others the centre lies on an outline, within a rounding error."""
 
 
-def rasterizer(geometry: Geometry, camera: Camera, side: int, device: str = "cpu") -> Callable[[], Picture]:
+def rasterizer(geometry: Geometry, camera: Camera, side: int) -> Callable[[], Picture]:
     """Return a function that draws the triangles with a z-buffer: `side` x `side` pixels, seen from the centre of the lens."""
     if not isinstance(camera, Camera):
         raise InputError(f"is {camera.kind}; the rasterizer needs a perspective camera", place=f"camera {camera.name!r}")
-    place, c = start(device), camera_struct(camera, (side, side))
+    place, c = start("cpu"), camera_struct(camera, (side, side))
     right, up, forward = (np.array(list(axis), np.float64) for axis in (c.right, c.up, c.forward))
     tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # as in the float32 camera of the rays
     from_pixels = np.column_stack([2.0 * tan_x / side * right, -2.0 * tan_y / side * up, forward - tan_x * right + tan_y * up])

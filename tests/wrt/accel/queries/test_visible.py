@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 import wrt
 from tests.kernel_tools import vec3s
@@ -204,6 +205,7 @@ def test_spheres_and_instances_are_in_the_way() -> None:
     ([[0, 0, 2e37]], [[0, 0, 1]], {}, ("a", "within 1e")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_a": [60]}, ("on_a", "-1 to 59")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, ("on_b", "whole number")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": wp.array([1 << 30], dtype=wp.int32, device="cpu")}, ("on_b", "-1 to 59")),
     ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, ("out", "(1,)")),
 ])
 def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: Refusal) -> None:

@@ -213,7 +213,8 @@ def test_clear_coat_and_specular(tmp_path):
     assert (material.clearcoat, material.clearcoat_roughness) == (0.5, 0.25)
     assert (material.specular_factor, material.specular_color) == (0.75, (1.0, 0.5, 2.0))
     assert material.is_coated and material.scales_reflectance
-    nothing = {"KHR_materials_clearcoat": {"clearcoatRoughnessFactor": 1}, "KHR_materials_specular": {}}
+    nothing = {"KHR_materials_clearcoat": {"clearcoatRoughnessFactor": 1, "clearcoatNormalTexture": {"index": 0}},
+               "KHR_materials_specular": {}}
     plain = material_of({"extensions": nothing}, tmp_path)
     assert not plain.is_coated and not plain.scales_reflectance and plain.is_rough
 

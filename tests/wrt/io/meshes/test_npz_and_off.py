@@ -91,7 +91,10 @@ def test_what_npz_refuses(tmp_path: Path) -> None:
         with pytest.raises(wrt.InputError) as caught:
             wrt.load_mesh(tmp_path / "a.npz")
         assert what in str(caught.value) and "a.npz" in str(caught.value)
-    for data in (b"", b"PK", b"x" * 100):
+    np.savez_compressed(tmp_path / "a.npz", **good)
+    whole = (tmp_path / "a.npz").read_bytes()
+    begin = whole.index(b"vertices.npy") + 32  # of zlib's data, behind NumPy's extra field
+    for data in (b"", b"PK", b"x" * 100, whole[:begin] + b"\xff" * 20 + whole[begin + 20:]):
         (tmp_path / "a.npz").write_bytes(data)
         with refused(None, "no NumPy archive", path="a.npz"):
             wrt.load_mesh(tmp_path / "a.npz")
