@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 import wrt
 from tests.kernel_tools import DEVICE
+from wrt.compat.trimesh import RayMeshIntersector
 from wrt.scene.shapes import icosphere
 
 N = 100
@@ -118,6 +120,7 @@ OTHERS: dict[str, Call] = {  # more forms of the same calls
     "counters": lambda s: s.accel.closest_hit(*s.rays, counters=True),
     "broadcast": lambda s: s.accel.closest_hit(s.rays[0][0], s.rays[1]),
     "a point of NumPy arrays": lambda s: s.hits_on_host.point,
+    "an adapter": lambda s: RayMeshIntersector(trimesh.Trimesh(BALL.vertices, BALL.faces)).intersects_any(*s.rays),
     "wp.Mesh": lambda s: wrt.build(s.wp_mesh),
     "on_a": lambda s: wrt.visible(s.bvh2, *s.warp, on_a=s.hits_on_host.prim_id),
     "winding": lambda s: wrt.signed_distance(s.accel, s.rays[0], sign="winding"),

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -221,12 +222,9 @@ def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, .
     assert "\\x1b" in result.out or "\\x07" in result.out
 
 
-def no_thread() -> None:
-    raise RuntimeError("can't start new thread")  # words of CPython's _thread
-
-
-@pytest.mark.parametrize(("ask", "words"), [(lambda: np.empty(1 << 58, np.uint8), "Unable to allocate"), (no_thread, "can't start"),
-                                            (lambda: wp.empty((1 << 20, 1 << 20, 1 << 10)), "Failed to allocate")])
+@pytest.mark.parametrize(("ask", "words"), [
+    (lambda: np.empty(1 << 58, np.uint8), "Unable to allocate"), (lambda: wp.empty((1 << 20, 1 << 20, 1 << 10)), "Failed to allocate"),
+    (Mock(side_effect=RuntimeError("can't start new thread")), "can't start new thread")])  # words of CPython
 def test_no_memory_is_no_traceback(ask: Callable[[], object], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.renderer.render.prepare", lambda *arguments: ask())
     refused(run("render", "box.obj"), f"error: not enough memory: {words}")
