@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -184,4 +185,10 @@ def answer_arrays(types: Mapping[str, np.dtype], out: Sequence[Any] | None, shap
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device} and")
             raise InputError(f"must be a {kind} array {shape} of {dtype}, {place} contiguous, got {shown(array)}", argument=name)
         arrays.append(array if array.ndim == 1 else in_shape(array, (n,)) if device is not None else array.reshape(-1))
+    if device is None and all(array.base is None for array in arrays) and len({*map(id, arrays)}) == len(arrays):
+        return arrays  # the usual call
+    # The arrays are contiguous, so that they overlap exactly if their bounds do.
+    for (name, one), (other, two) in combinations(zip(types, arrays, strict=True), 2):
+        if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
+            raise InputError(f"shares memory with {other}", argument=name)
     return arrays

@@ -217,3 +217,26 @@ def test_the_limits_themselves_are_accepted(n: int, sign: float) -> None:
     assert (hits.prim_id >= 0).all() and (hits.t <= np.float32(5.0) / np.float32(LARGEST)).all()
     with pytest.raises(wrt.InputError):
         accel.closest_hit(np.nextafter(far, np.float32(sign * np.inf)), down)
+
+
+@pytest.mark.parametrize("as_warp", [False, True])
+def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) -> None:
+    """Arrays of different types or that share only a part are refused, too. Adjacent arrays are accepted."""
+    rays: tuple[Any, ...] = some_rays(4)
+    memory, own = np.zeros(16, np.float32), [np.zeros(4, np.float32) for _ in range(2)]
+    whole: Any = to_warp(memory).to(DEVICE) if as_warp else memory
+    if as_warp:
+        rays, own = tuple(to_warp(a, wp.vec3) for a in rays), [to_warp(a).to(DEVICE) for a in own]
+
+    def ids(begin: int) -> Any:
+        part = whole[begin:begin + 4]
+        return part.view(wp.int32) if as_warp else part.view(np.int32)
+
+    t = whole[:4]
+    for room, named in (((t, own[0], t, ids(8)), ("out.t", "out.v")), ((own[0], own[1], t, ids(0)), ("out.v", "out.prim_id")),
+                        ((own[0], t, whole[3:7], ids(8)), ("out.u", "out.v")), ((whole[5:9], own[0], own[1], ids(2)),
+                                                                             ("out.t", "out.prim_id"))):
+        with refused(*named):
+            ball.closest_hit(*rays, out=Hits(*room))
+    room = t, whole[4:8], whole[12:], ids(8)
+    assert bits(ball.closest_hit(*rays, out=Hits(*room))) == bits(ball.closest_hit(*rays))
