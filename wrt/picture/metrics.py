@@ -78,8 +78,14 @@ def _shown_errors(a: np.ndarray, b: np.ndarray, finite: np.ndarray, exposure: fl
 def failures(result: Mapping[str, float], limits: Mapping[str, float | None]) -> list[str]:
     """Return one sentence for each limit that a result of `compare` violates.
 
-    - limits: by name: a lower limit for psnr, upper limits for other measures; None for no limit. NaN violates every limit. With any limit,
-      pixels that are NaN or infinite in a picture and at which the two differ are a failure, too."""
+    Parameters
+    ----------
+    result
+        Result of `compare`.
+    limits
+        Limits by name: a lower limit for psnr, upper limits for other measures; None for no limit. NaN violates every limit. With any
+        limit, pixels that are NaN or infinite in a picture and at which the two differ are a failure, too.
+    """
     active = {name: limit for name, limit in limits.items() if limit is not None}
     sentences = []
     for name, limit in active.items():
@@ -114,12 +120,24 @@ def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """Compute LDR-FLIP, the difference seen when two pictures alternate on a screen, with OpenImageIO: (H, W) float32, 0 (none) to 1.
+    """Compute LDR-FLIP, the difference seen when two pictures alternate on a screen, with OpenImageIO.
 
-    - a, b: (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite, in any order; pixels_per_degree: of the visual angle.
+    Parameters
+    ----------
+    a, b
+        (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite, in any order.
+    pixels_per_degree
+        Pixels per degree of the visual angle.
 
-    Source: Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom and Fairchild,
-    "FLIP: A Difference Evaluator for Alternating Images", 2020."""
+    Returns
+    -------
+    (H, W) float32
+        0 (no difference) to 1.
+
+    References
+    ----------
+    Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A Difference Evaluator for Alternating Images", HPG 2020.
+    """
     with needed_by("FLIP"):
         import OpenImageIO as oiio
 
@@ -135,9 +153,23 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
 
 
 def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Draw the linear difference |a - b| of the channel that differs most as a heat map with its scale, (H, W, 3) uint8 (see `heatmap`).
+    """Draw the linear difference |a - b| of the channel that differs most as a heat map with its scale, (H, W, 3) uint8.
 
-    Where a and b differ and are not both finite, it has the last colour. Raises InputError if the sizes differ."""
+    Parameters
+    ----------
+    a, b
+        Picture and reference, (H, W, 3) linear. Where they differ and are not both finite, the picture has the last colour.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        See `heatmap`: also larger than the pictures.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ.
+    """
     a, b = _pair(a, b)
     with np.errstate(invalid="ignore"):  # inf - inf
         difference = np.where((a == b) | (np.isnan(a) & np.isnan(b)), np.float32(0.0), np.abs(a - b)).max(axis=-1)
