@@ -40,7 +40,7 @@ LAYERS_OF_ACCEL = (
     {"geometry", "device_geometry", "flat_scene"},  # geometry
     {"structures", "snapshot"},  # kinds of structures, and the state of a structure
     {"queries"},
-    {"store", "scene_arrays", "base", "box_tree", "tensors"},
+    {"store", "base", "box_tree", "tensors"},
     {"bvh", "cells", "brute_force"},
     {"top_level", "moves", "instances"},
     {"scenes"},

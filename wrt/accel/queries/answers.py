@@ -49,7 +49,7 @@ class Counters:
         return self.counts[name]
 
     def __repr__(self) -> str:
-        means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
+        means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or () if self.counts.size)
         return f"Counters({self.counts.size} rays; mean per ray: {means})" if self.counts.size else "Counters(0 rays)"
 
     def _repr_html_(self) -> str:
