@@ -192,7 +192,7 @@ class Instances(Accelerator):
         if not self._snapshot.changes:
             self._begin_in_place()
         top, (matrices, ids) = self._top, (*given, self._cache["all"])[:2]
-        key = len(ids), ids.dtype, matrices.ptr, matrices.dtype, matrices.shape, matrices.strides, matrices.device, ids.device
+        key = ids.shape, ids.strides, ids.dtype, matrices.ptr, matrices.dtype, matrices.shape, matrices.strides, matrices.device, ids.device
         known, transforms = self._cache.get("transforms", (None, None))
         if key != known:  # making the struct takes longer than moving a few instances
             transforms = checked_transforms(ids, matrices, self.device)

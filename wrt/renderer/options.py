@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -111,8 +110,8 @@ class Options:
             require_known(name, AOVS, "AOV", "aov")
         for name in ("time_limit", "target_error", "checkpoint_every"):  # None is valid where it is the default
             value = as_one(getattr(self, name), (int, float, np.number, type(getattr(Options, name))), name)
-            if value is not None and not 0.0 < float(value) < math.inf:
-                raise InputError(f"must be more than 0 and finite, got {value}", argument=name)
+            if value is not None and not 0.0 < float(value):
+                raise InputError(f"must be more than 0, got {value}", argument=name)
         for name, (low, high) in WHOLE.items():
             if getattr(self, name) is not None or getattr(Options, name) is not None:
                 setattr(self, name, as_integer(getattr(self, name), name, low, high))

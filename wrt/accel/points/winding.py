@@ -93,6 +93,8 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
 
 
 def _of_mesh(snapshot: Snapshot, points: np.ndarray, threads: int, exact: bool) -> np.ndarray:
+    if not len(finite_faces(snapshot.mesh)):
+        return np.zeros(len(points))
     device, surfaces = snapshot.device, device_scene(snapshot).surfaces
     turns = wp.empty(len(points), dtype=wp.vec3d, device=device)
     kernel, inputs = (wind, [surfaces]) if exact else (wind_by_tree, [surfaces, *winding_tree(snapshot, threads)])

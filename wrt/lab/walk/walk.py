@@ -202,6 +202,8 @@ def section_of(walk: Walk) -> Section:
     across = axis - (axis @ along) * along
     plane = Plane(walk.origin.astype(np.float64), along, across / np.linalg.norm(across))
     low, high = walk.geometry.bounds()  # of each triangle and sphere
+    if not len(low):
+        raise InputError("has nothing to draw: its mesh is empty", argument="walk")
     lo, hi = low.min(axis=0).astype(np.float64), high.max(axis=0).astype(np.float64)
     corners = np.array([[(lo, hi)[k >> a & 1][a] for a in range(3)] for k in range(8)])
     flat = plane.project(corners)

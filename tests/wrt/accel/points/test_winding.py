@@ -153,3 +153,9 @@ def test_corners_nothing_and_what_is_refused() -> None:
                                 ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure without spheres"))):
         with refused(*said):
             wrt.winding_number(accel, points)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_an_empty_mesh_winds_around_nothing(exact: bool) -> None:
+    accel = wrt.build((np.zeros((1, 3)), np.zeros((0, 3), np.int32)))
+    assert wrt.winding_number(accel, np.zeros((2, 3)), exact=exact).tolist() == [0.0, 0.0]
