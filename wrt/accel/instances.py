@@ -199,6 +199,7 @@ class Instances(Accelerator):
             self._cache["transforms"] = key, transforms
         check_no_gradients("a move", matrix=matrices)
         if check:
+            refuse_capture(self.device)
             trial = top.copied()
             trial.place(ids, transforms)
             refuse_invalid(check_ids(self._cache["rows"], ids.numpy()), trial.data.invalid.numpy())

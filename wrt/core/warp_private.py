@@ -159,7 +159,7 @@ def refuse_capture(device: Device | None = None) -> None:
             name = frame.f_code.co_qualname
         frame = frame.f_back
     raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture; a kernel of your own with"
-                     " wrt.ray_query can be captured, and so can, on a GPU, what docs/moving.md lists")
+                     " wrt.ray_query can be captured, and so can what docs/moving.md lists")
 
 
 # --- kernels and their files ------------------------------------------------------------------------------------------

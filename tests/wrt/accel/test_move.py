@@ -373,6 +373,8 @@ def test_a_graph_of_the_cpu_captures_a_move_in_place() -> None:
     with refused(None, "the first move in place"), wp.ScopedCapture("cpu"):
         accel.move(poses)
     accel.move(poses)
+    with refused(None, "cannot be captured"), wp.ScopedCapture("cpu"):
+        accel.move(poses, check=True)
     with wp.ScopedCapture("cpu") as capture:
         accel.move(poses)
         wp.launch(trace, 500, [accel.world, origins, directions, t], device="cpu")
