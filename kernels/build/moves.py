@@ -155,7 +155,7 @@ def fused(a: wp.float64, b: wp.float64, c: wp.float64) -> wp.float64:
 
 @wp.func
 def times(a: wp.mat33d, v: wp.vec3d) -> wp.vec3d:
-    """Return a v, with the arithmetic of NumPy's product of a matrix and a column in OpenBLAS."""
+    """Return a v, with the arithmetic of OpenBLAS for processors with AVX2 and FMA."""
     out = wp.vec3d()
     for k in range(3):
         out[k] = fused(a[k, 2], v[2], fused(a[k, 0], v[0], a[k, 1] * v[1]))
@@ -164,7 +164,8 @@ def times(a: wp.mat33d, v: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def inverted(a: wp.mat33d) -> wp.mat33d:
-    """Return the inverse, with the arithmetic of LAPACK's gesv in OpenBLAS (numpy.linalg.inv); not finite if `a` has none."""
+    """Return the inverse, not finite if `a` has none. The arithmetic is that of LAPACK's gesv in OpenBLAS (numpy.linalg.inv) for processors
+    with AVX2 and FMA; here it has the same bits on every device."""
     m = a
     b = wp.identity(n=3, dtype=wp.float64)
     one = wp.float64(1.0)
