@@ -164,8 +164,7 @@ def times(a: wp.mat33d, v: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def inverted(a: wp.mat33d) -> wp.mat33d:
-    """Return the inverse, not finite if `a` has none. The arithmetic is that of LAPACK's gesv in OpenBLAS (numpy.linalg.inv) for processors
-    with AVX2 and FMA; here it has the same bits on every device."""
+    """Return the inverse, not finite if `a` has none, with the steps of LAPACK's gesv in OpenBLAS for processors with AVX2 and FMA."""
     m = a
     b = wp.identity(n=3, dtype=wp.float64)
     one = wp.float64(1.0)

@@ -212,9 +212,9 @@ _CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "v
            "enable_vector_component_overwrites": False, "default_grid_stride": True}
 _OPTIONS = {"max_unroll": 16, "deterministic": _NOT_GUARANTEED, "deterministic_max_records": 0}
 # Flags for the CPU of Warp 1.19. Clang of 1.17 and 1.18 refuses them.
-_FLAGS = {"1.17": "", "1.18": ""}.get(
-    wp.config.version[:4], "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4")
-# Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
+_FLAGS = "" if wp.config.version.startswith(("1.17.", "1.18.")) else (
+    "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4")
+# Modules of wrt keep three kinds of the user's flags: the processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
 _KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
 
 

@@ -19,7 +19,7 @@ from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
 LENGTHS = 0, 4, 5, 8, 12  # Numbers of coefficients: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4.
 STEPS = 64  # Of the path from the centre to a point.
 NODES = 65  # Of the grid of a picture, at most, along each side.
-EXACT = 1e-13  # Largest error of an inverse, on the plane z = 1 and relative to a point there that is farther than 1.
+EXACT = 1e-13  # Largest error of an inverse on the plane z = 1; relative for a point farther than 1 from the centre.
 Points = tuple[np.ndarray, np.ndarray]  # x and y
 Rays = tuple[np.ndarray, np.ndarray]  # directions (..., 3), and whether each exists
 
@@ -48,7 +48,7 @@ class Radial:
         return _at_depth_1(*self._undistort(x, y))
 
     def rays_of_picture(self, x: np.ndarray, y: np.ndarray) -> Rays:
-        """Return `rays` of the pixels of a picture, (rows, columns). The inverse of each pixel begins at that of a near pixel.
+        """Return `rays` of the pixels of a picture, (rows, columns). The inverse of each pixel begins at the inverse of a near pixel.
 
         If some of the near pixels have no ray, only these are reported.
         """

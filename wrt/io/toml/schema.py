@@ -29,8 +29,8 @@ BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exc
 
 
 class Table(dict[str, Any]):
-    """Schema of a table. one_of: keys of which exactly one must be given; apart: for a key, the keys that may not stand beside it; needs:
-    for a key, the keys that it needs."""
+    """Schema of a table. one_of: groups of keys; a table has exactly one key of each group. apart: keys that exclude other keys.
+    needs: keys that require other keys."""
 
     def __init__(self, about: str, /, *one_of: tuple[str, ...], apart: Mapping[str, Iterable[str]] | None = None,
                  needs: Mapping[str, list[str]] | None = None, **keys: Schema) -> None:

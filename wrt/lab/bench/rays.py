@@ -1,5 +1,5 @@
-"""What measurements trace: meshes (hills, a mesh in a large stadium, many small worlds) and rays (primary, shadow and diffuse rays of a
-picture, incoherent rays, points, and many small pictures)."""
+"""Meshes and rays of measurements. Meshes are hills, a mesh in a large stadium, and many small worlds. Rays are the primary, shadow and
+diffuse rays of a picture, incoherent rays, points, and many small pictures."""
 
 from dataclasses import dataclass
 from typing import Any

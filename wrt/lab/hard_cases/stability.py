@@ -155,7 +155,7 @@ def _respawn_kernel(structure: Structure) -> Kernel:
 
 
 def respawn(one: Own, case: HardCase, exclude: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each.
+    """Return prim_id of each ray's hit, (N,) int32. A second ray starts there along case.next_directions; return its hit's prim_id, too.
     exclude: the second ray excludes the triangle on which it starts, as in a render."""
     accel, n = one.accel, len(case)
     assert case.next_directions is not None

@@ -125,8 +125,8 @@ class Rival:
         self.start = imports + float(np.median(rest[1:])) if times else imports
 
     def result(self, ours: Row, truth: Row) -> Row:
-        """Return the figures of `side_of`. ratio, process_ratio: Mitsuba's time at wrt's error over wrt's time, to trace and in all.
-        same_light: False if Mitsuba's squared bias is above SAME times wrt's squared error. Then the pictures show different light."""
+        """Return the figures of `side_of`, and ratio and process_ratio: Mitsuba's time at wrt's error over wrt's, to trace and in all.
+        same_light: False if Mitsuba's squared bias is above SAME times wrt's squared error: the pictures show different light."""
         side = side_of(self.spp, self.runs, truth, self.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
         side.process_seconds = self.start + factor * float(np.median(side.seconds))

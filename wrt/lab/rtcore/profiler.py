@@ -195,8 +195,8 @@ class _Tile:
 
 
 class Profiler:
-    """Render with a structure that counts its steps and logs its rays, in three passes over each tile: count the rays of each pixel,
-    record the rays with their counters, record their fetches."""
+    """Render with a structure that counts its steps and logs its rays. Each tile takes three passes: count the rays of each pixel, record
+    the rays with their counters, record their fetches."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         self.device, plan = start(options.device), plan_of(scene, options)
@@ -229,7 +229,7 @@ class Profiler:
 
     def _trace(self, rectangle: Rectangle, film: int, used: np.ndarray | None = None,
                first_fetch: np.ndarray | None = None) -> tuple[Recorder, ray_log.RayLog]:
-        """Trace all samples of a tile. With `used`, the number of rays of each pixel, count and log each ray, else sum over pixels.
+        """Trace all samples of a tile. used: number of rays of each pixel, to count and log each ray; None: sum over the rays of a pixel.
         first_fetch: index of each ray's first fetch, and the end; None: record no fetches."""
         recorder, log = Recorder(), ray_log.RayLog()
         zeros = partial(wp.zeros, device=self.device)

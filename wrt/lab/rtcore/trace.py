@@ -59,7 +59,7 @@ class Trace:
     child_address: np.ndarray  # child_address, child_size: (K,) int64, node or all primitives of the leaf.
     child_size: np.ndarray
     child_t: np.ndarray  # (K,) float32, where the ray enters the child; inf if it does not.
-    # Prefetches, (P,) int64, of which a new trace has none: fetch that starts it, ascending; bytes.
+    # Prefetches, (P,) int64: fetch that starts it, ascending; bytes. A new trace has none.
     prefetch_after: np.ndarray
     prefetch_address: np.ndarray
     prefetch_size: np.ndarray

@@ -93,8 +93,8 @@ class WalkStep:
     count: int  # -1 for a node, else the number of primitives of a leaf.
     depth: int  # Number of links from the root to the present node or leaf.
     result: str  # Of a test: an entry of kernels.traverse.steps.RESULTS. Else "entered", "missed", "taken", "dropped", or "".
-    # Box, part, cell: where the ray enters and leaves, also if it misses; plane: where the line crosses it; push, pop: where the ray
-    # enters the entry; test: of the hit on the whole line, inf on a miss.
+    # Box, part, cell: where the ray enters and leaves, also if it misses. Plane: where the line crosses it. Push, pop: where the ray
+    # enters the entry. Test: of the hit on the whole line, inf on a miss.
     t: float
     t_end: float
     prim_id: int  # Of a test, else -1.

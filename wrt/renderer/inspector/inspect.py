@@ -62,8 +62,8 @@ class Inspection:
     def radiance(self) -> np.ndarray:
         """The mean of the samples, (3,) float32: the bits of the pixel that `render` returns if all samples are inspected.
 
-        The film keeps a running mean in float32, mean += (sample - mean) / n, to which a sample that is not finite adds black,
-        and a sample over the setting `clamp` its scaled radiance."""
+        The film keeps a running mean in float32, mean += (sample - mean) / n. A sample that is not finite is black, and a sample over
+        the setting `clamp` is scaled down."""
         mean, limit = np.zeros(3, np.float32), np.float32(self.scene.settings.clamp)
         with np.errstate(over="ignore", invalid="ignore"):
             for n, sample in enumerate(self.samples, 1):
