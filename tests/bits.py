@@ -1,4 +1,6 @@
-"""Hash the pixels of the shipped scenes and the hits of the structures: `python -m tests.bits > tests/bits.txt` stores the hashes."""
+"""Hash the pixels of the shipped scenes, and the hits of structures and of moving worlds.
+
+`python -m tests.bits > tests/bits.txt` stores the hashes."""
 
 from __future__ import annotations
 
@@ -65,6 +67,33 @@ def hits(accel: str) -> str:
     return digest(hit.t, hit.u, hit.v, hit.prim_id, seen.t, seen.u, seen.v, seen.prim_id, occluded)
 
 
+def moving_worlds(kind: str = "bvh8", order: str = "given", rebuilt: bool = False, threads: int | None = None) -> str:
+    """Return a hash of depth and ids in three worlds of moving bodies, after each of four steps.
+
+    order: of the bodies of a step: "given", "reversed", "twice" (first to places of another step), or "in place" (all at once).
+    rebuilt: a new structure for each step. Poses and rays are multiples of 2^-10, so that no function of a library plays a part.
+    """
+    scene = wrt.Scene(tuple(wrt.Object(mesh) for mesh in (
+        shapes.icosphere(2), shapes.box((-0.5, -0.3, -0.4), (0.5, 0.3, 0.4)), shapes.torus(0.5, 0.2, 24, 12))))
+    rng, found = np.random.default_rng(4), []
+    matrices = rng.integers(-1024, 1024, (4, 9, 3, 4)) / 1024.0 + 1.5 * np.eye(3, 4)
+    origins = (rng.integers(-1024, 1024, (RAYS, 3)) / 256.0).astype(np.float32)
+    directions = (rng.integers(-1024, 1024, (RAYS, 3)) / 1024.0 - origins).astype(np.float32)
+    ids = np.arange(9)[::-1 if order == "reversed" else 1]
+    accel = wrt.build([scene] * 3, kind, threads=threads)
+    for step in range(4):
+        if rebuilt:
+            accel = wrt.build([scene] * 3, kind, threads=threads)
+        if order == "twice":
+            accel.move(ids, matrices[(step + 2) % 4])
+        moves: Any = wp.array(matrices[step], dtype=wp.float64, device=DEVICE) if order == "in place" else matrices[step]
+        accel.move(moves) if order == "in place" else accel.move(ids, moves[ids])
+        hit = accel.closest_hit(origins, directions, world=np.arange(RAYS) % 3, threads=threads)
+        assert (hit.prim_id >= 0).mean() > 0.3
+        found += [hit.t, hit.object, hit.prim_id, hit.u, hit.v]
+    return digest(*found)
+
+
 def primary_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return origins and directions, (N, 3) float32, of a pinhole camera. Computed in float64, so that no device code plays a part."""
     pose = wrt.Camera.look_at((0.0, 2.0, 4.0), (0.0, 0.0, 0.0)).camera_to_world
@@ -81,7 +110,8 @@ def stored() -> dict[str, str]:
 
 
 def main() -> None:
-    print("hits", hits("bvh"))
+    print("hits", hits("bvh8"))
+    print("moving_worlds", moving_worlds(), flush=True)
     for scene in SCENES:
         print(scene.stem, pixels(scene), flush=True)
 

@@ -44,6 +44,11 @@ def test_hits_have_the_bits_of_the_cpu(accel: str) -> None:
     assert gpus().counts.launches.total() == before + 3
 
 
+@pytest.mark.parametrize("order", ["given", "in place"])
+def test_moving_worlds_have_the_same_depth_and_ids_as_on_the_cpu(order: str) -> None:
+    assert bits.moving_worlds(order=order) == bits.stored()["moving_worlds"]
+
+
 @pytest.mark.parametrize("scene", [path if path == SCENE else pytest.param(path, marks=pytest.mark.slow) for path in bits.SCENES],
                          ids=lambda path: path.stem)
 def test_pixels_have_the_bits_of_the_cpu(scene: Path) -> None:
