@@ -8,8 +8,8 @@ from wrt.core.errors import InputError
 # Names of packages that differ from the names of their modules.
 INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "mapbox_earcut": "mapbox-earcut"}
 # Modules that only an extra of wrt installs, and the extra; tests/wrt/core/test_packages.py compares with pyproject.toml.
-EXTRAS = {"DracoPy": "draco", "distributed": "cluster", "embreex": "peers", "jax": "jax", "matplotlib": "plots",
-          "meshopt": "meshopt", "mitsuba": "peers", "pyarrow": "tables", "pyvista": "pyvista", "torch": "torch", "websockets": "viewer"}
+EXTRAS = {"distributed": "cluster", "embreex": "peers", "jax": "jax", "matplotlib": "plots",
+          "mitsuba": "peers", "pyarrow": "tables", "pyvista": "pyvista", "torch": "torch", "websockets": "viewer"}
 
 
 @contextmanager

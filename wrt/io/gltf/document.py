@@ -1,8 +1,7 @@
 """A glTF 2.0 file: the container (.gltf, .glb), its JSON, its buffers and accessors, and the files that it refers to.
 
 Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers, accessors) and 4 (GLB); KHR_mesh_quantization for integer
-positions; EXT_meshopt_compression and KHR_meshopt_compression. A file that does not require these two has plain buffers, which wrt reads
-instead.
+positions. Compressed meshes (COMPRESSIONS) are not decoded: a file that does not require a compression has plain buffers beside it.
 """
 
 import base64
@@ -18,15 +17,13 @@ import numpy as np
 from wrt.core.checks import listed, short
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.gltf.schema import EXTENSIONS, FILE, ITEMS, read
 
 GltfObject: TypeAlias = Any  # a namespace with the keys that wrt.io.gltf.schema declares
 GLB_MAGIC = b"glTF"
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
-MESHOPT = ("KHR_meshopt_compression", "EXT_meshopt_compression")
-_MOST = 1024  # bytes for which one byte of meshopt's data can stand: four columns of a block of 256 vertices, if all are 0
+COMPRESSIONS = frozenset({"KHR_draco_mesh_compression", "KHR_meshopt_compression", "EXT_meshopt_compression"})
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_COUNT = 2**31 - 1
@@ -58,7 +55,7 @@ class LeftOut:
     def add_extensions(self, extensions: JsonObject | None, kind: str, name: str) -> None:
         """Record the extensions of an object that could change the picture and are not read by wrt."""
         for extension in extensions or ():
-            if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
+            if extension not in SUPPORTED_EXTENSIONS | METADATA_EXTENSIONS | COMPRESSIONS:
                 self.add(extension, kind, name)
 
     def clamp(self, value: Any, low: float, high: float, what: str, kind: str, name: str) -> Any:
@@ -95,11 +92,10 @@ class Document:
         unknown = set(self.gltf.extensionsRequired) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS - DEFAULT_LOOK
         unknown = {each for each in unknown if not (shapes_only and each.startswith(_LOOKS))}
         if unknown:
-            raise InputError(f"the file needs {listed(sorted(unknown))}, which wrt does not support", place="extensionsRequired",
-                             hint="save the file without it")
+            hint = "decompress the meshes: gltf-transform copy IN OUT" if unknown <= COMPRESSIONS else "save the file without it"
+            raise InputError(f"the file needs {listed(sorted(unknown))}, which wrt does not support", place="extensionsRequired", hint=hint)
         self.left_out, self.mistakes = LeftOut(), LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
-        self._decoded: dict[int, np.ndarray] = {}  # compressed buffer views
 
     def raw(self, array: str) -> list[Any]:
         """Return the unchecked items of an array of the file; [] if it has none."""
@@ -130,17 +126,6 @@ class Document:
     def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
         """Return the bytes (N,) uint8 of a buffer view, and its stride in bytes or None."""
         view, where = self.item("bufferViews", index, place), f"bufferViews[{index}]"
-        for name in MESHOPT:
-            compressed = self.extension(view, name, where) if name in self.gltf.extensionsRequired else None
-            if compressed is not None:
-                if index not in self._decoded:
-                    inside = f"{where}.extensions.{name}"
-                    self._decoded[index] = _decode_meshopt(self._slice(compressed, inside), compressed, view.byteLength, inside)
-                return self._decoded[index], view.byteStride
-        return self._slice(view, where), view.byteStride
-
-    def _slice(self, view: GltfObject, where: str) -> np.ndarray:
-        """Return the bytes of a buffer from `byteOffset` on."""
         data = self._buffer(view.buffer, f"{where}.buffer")
         start, length = view.byteOffset, view.byteLength
         if length < 1:
@@ -148,7 +133,7 @@ class Document:
         if start < 0 or start + length > len(data):
             raise InputError(f"bytes {start} to {start + length} reach outside of buffers[{view.buffer}], "
                              f"which has {len(data)} bytes", place=where)
-        return data[start:start + length]
+        return data[start:start + length], view.byteStride
 
     def _buffer(self, index: int, place: str) -> np.ndarray:
         if index not in self._buffers:
@@ -196,28 +181,20 @@ class Accessors:
             raise InputError(f"must be of type {kind}, but {where} is {short(accessor.type)}", place=place)
         with at(place):
             if index not in self._arrays:
-                self._put(index, self._decode(accessor, where), accessor, where)
+                self._arrays[index] = self._normalised(self._decode(accessor, where), accessor, where)
             if finite:
                 require_finite(self._arrays[index], where)
         return self._arrays[index]
 
-    def put(self, index: int, values: np.ndarray, place: str) -> None:
-        """Set the array of accessor `index`, (count, components), which a compressed mesh holds. Raises InputError if it does not fit."""
-        accessor = self._document.item("accessors", index, place)
-        shape = accessor.count, _WIDTHS.get(accessor.type)
-        if values.shape != shape:
-            raise InputError(f"decodes to {values.shape} numbers, but accessors[{index}] has {shape}", place=place)
-        self._put(index, values.copy(), accessor, f"accessors[{index}]")
-
-    def _put(self, index: int, array: np.ndarray, accessor: GltfObject, where: str) -> None:
-        """Keep the array of an accessor. Normalised: 8- and 16-bit integers become float32 in [0, 1] or [-1, 1] by the specification's
-        table, which clamps the most negative value."""
+    def _normalised(self, array: np.ndarray, accessor: GltfObject, where: str) -> np.ndarray:
+        """Return the read-only array of an accessor. Normalised: 8- and 16-bit integers become float32 in [0, 1] or [-1, 1] by the
+        specification's table, which clamps the most negative value."""
         if accessor.normalized:
             if array.dtype.kind == "f" or array.dtype.itemsize > 2:
                 raise InputError("only 8- and 16-bit integers can be normalised", place=f"{where}.normalized")
             array = np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))
         array.flags.writeable = False
-        self._arrays[index] = array
+        return array
 
     def _decode(self, accessor: GltfObject, where: str) -> np.ndarray:
         dtype, count = _dtype(accessor.componentType, where), accessor.count
@@ -274,23 +251,6 @@ def _dtype(component_type: int, where: str) -> np.dtype:
     if component_type not in _DTYPES:
         raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}", place=f"{where}.componentType")
     return np.dtype(_DTYPES[component_type])
-
-
-def _decode_meshopt(data: np.ndarray, view: GltfObject, length: int, place: str) -> np.ndarray:
-    """Return the `length` bytes (N,) uint8 of a buffer view that meshoptimizer compressed to `data`.
-
-    Raises InputError if meshopt is missing, or if the data are damaged or do not have this length."""
-    if view.count < 1 or view.count * view.byteStride != length:
-        raise InputError(f"{view.count} elements of {view.byteStride} bytes do not fill the {length} bytes of the buffer view", place=place)
-    if length > _MOST * len(data):
-        raise InputError(f"{len(data)} bytes of data are too few for {length}", place=place)
-    with needed_by("a glTF file with meshopt compression"):
-        import meshopt
-    try:
-        decoded = meshopt.decode_gltf_buffer(data.tobytes(), view.count, view.byteStride, view.mode, view.filter)
-    except ValueError as error:
-        raise InputError(f"is not data that meshoptimizer compressed ({error})", place=place) from error
-    return decoded.reshape(-1).view(np.uint8)
 
 
 def _read_container(path: Path) -> tuple[object, memoryview | None]:

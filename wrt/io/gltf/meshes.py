@@ -1,17 +1,15 @@
 """The node graph of a glTF file; its meshes; skins, which move vertices by nodes, without animation; instances of nodes.
 
-Source: Khronos, glTF 2.0 specification, sections 3.5 (nodes) and 3.7 (meshes, skins); EXT_mesh_gpu_instancing, KHR_mesh_quantization,
-KHR_draco_mesh_compression. A file that does not require Draco has plain accessors, which wrt reads instead.
+Source: Khronos, glTF 2.0 specification, sections 3.5 (nodes) and 3.7 (meshes, skins); EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
 from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.core.packages import needed_by
 from wrt.io.gltf.document import Accessors, Document, GltfObject, require_finite
 from wrt.io.gltf.schema import read
 from wrt.io.mesh_file import strip
@@ -42,9 +40,6 @@ def _fan(indices: np.ndarray) -> np.ndarray:
 Targets: TypeAlias = list[tuple[float, dict[str, int]]]  # morph targets with their weights
 TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: strip, 6: _fan}
 _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
-
-DRACO = "KHR_draco_mesh_compression"
-READ_FROM_DRACO = ("POSITION", "NORMAL", "TEXCOORD_0", "JOINTS_", "WEIGHTS_")
 
 
 def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
@@ -226,15 +221,14 @@ class Meshes:
         return self._meshes[key]
 
     def _make(self, primitive: GltfObject, name: str, place: str, targets: Targets, skin: int | None) -> Mesh | None:
-        mode = _decode_draco(self._document, self._accessors, primitive, place)
         positions = self._attribute(primitive, "POSITION", "VEC3", place, targets)
         indices = self._indices(primitive, len(positions), place)
         require_finite(positions, f"{place}.attributes.POSITION: accessors[{primitive.attributes['POSITION']}]", indices)
         normals, uvs = (self._optional(primitive, *each, place, targets, name, len(positions))
                         for each in (("NORMAL", "VEC3"), ("TEXCOORD_0", "VEC2")))
-        if mode == 4 and len(indices) % 3:
+        if primitive.mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
-        faces = TRIANGULATE[mode](indices)
+        faces = TRIANGULATE[primitive.mode](indices)
         if skin is not None:
             blend = self._skins.blend(skin, primitive, len(positions), place)
             positions, normals, mirrored = moved(blend, positions, normals)
@@ -309,34 +303,3 @@ class Meshes:
             require_count(self._instances, "instances")
         return compose(*(found.get(name, np.broadcast_to(default, (count, len(default))))
                          for name, (_, default) in wanted.items()))
-
-
-def _decode_draco(document: Document, accessors: Accessors, primitive: GltfObject, place: str) -> int:
-    """Decode a compressed primitive into its accessors. Return its mode, which is 4 (a list of triangles) for every compressed primitive.
-
-    Raises InputError if DracoPy is missing, or if the data are damaged or do not fit the accessors."""
-    compressed = document.extension(primitive, DRACO, place)
-    if compressed is None or DRACO not in document.gltf.extensionsRequired:
-        return int(primitive.mode)
-    where = f"{place}.extensions.{DRACO}"
-    if primitive.mode not in (4, 5) or primitive.indices is None:
-        raise InputError("must be a list or a strip of triangles (mode 4 or 5) with indices", place=place)
-    with needed_by("a glTF file with Draco compression"):
-        import DracoPy
-    data, _ = document.view(compressed.bufferView, f"{where}.bufferView")
-    try:
-        mesh: Any = DracoPy.decode(data.tobytes())
-        faces, arrays = mesh.faces, {each["unique_id"]: each["data"] for each in mesh.attributes}
-    except Exception as error:  # DracoPy's own classes; AttributeError for a point cloud
-        raise InputError(f"is not a mesh that Draco compressed ({error})", place=where) from error
-    if primitive.mode == 5:  # the count is that of a strip, but Draco holds triangles
-        document.item("accessors", primitive.indices, f"{place}.indices").count = faces.size
-    accessors.put(primitive.indices, faces.reshape(-1, 1), f"{place}.indices")
-    for name, unique_id in compressed.attributes.items():
-        if not name.startswith(READ_FROM_DRACO):
-            continue
-        if unique_id not in arrays or name not in primitive.attributes:
-            raise InputError("must be an attribute of the primitive and of the compressed mesh", place=f"{where}.attributes.{name}")
-        array = arrays[unique_id]
-        accessors.put(primitive.attributes[name], array.reshape(len(array), -1), f"{place}.attributes.{name}")
-    return 4

@@ -32,7 +32,7 @@ ITEMS: dict[str, dict[str, Any]] = {
     "accessors": {
         "bufferView": int, "byteOffset": 0, "componentType": Needed(int), "normalized": False, "count": Needed(int), "type": Needed(str),
         "sparse": {"count": Needed(int), "indices": Needed(OF_SPARSE | {"componentType": Needed(int)}), "values": Needed(OF_SPARSE)}},
-    "bufferViews": {"buffer": Needed(int), "byteOffset": 0, "byteLength": Needed(int), "byteStride": int, "extensions": ANY},
+    "bufferViews": {"buffer": Needed(int), "byteOffset": 0, "byteLength": Needed(int), "byteStride": int},
     "buffers": {"uri": str, "byteLength": Needed(int)},
     "cameras": NAMED | {
         "type": Needed(str), "perspective": {"yfov": Needed(float)}, "orthographic": {"xmag": Needed(float), "ymag": Needed(float)}},
@@ -51,8 +51,6 @@ ITEMS: dict[str, dict[str, Any]] = {
     "skins": {"joints": [int], "inverseBindMatrices": int},
     "textures": NAMED | {"sampler": int, "source": int},
 }
-MESHOPT = {"buffer": Needed(int), "byteLength": Needed(int), "byteStride": Needed(int), "count": Needed(int), "mode": Needed(str),
-           "byteOffset": 0, "filter": "NONE"}
 EXTENSIONS: dict[str, dict[str, Any]] = {
     "KHR_texture_transform": {"offset": (0.0, 0.0), "rotation": 0.0, "scale": (1.0, 1.0), "texCoord": int},
     "EXT_texture_webp": {"source": Needed(int)},
@@ -71,9 +69,6 @@ EXTENSIONS: dict[str, dict[str, Any]] = {
     "KHR_materials_emissive_strength": {"emissiveStrength": 1.0},
     "KHR_materials_unlit": {},
     "KHR_lights_punctual": {"light": Needed(int)},  # of a node
-    "KHR_draco_mesh_compression": {"bufferView": Needed(int), "attributes": {str: int}},
-    "KHR_meshopt_compression": MESHOPT,
-    "EXT_meshopt_compression": MESHOPT,
     "EXT_mesh_gpu_instancing": {"attributes": {str: int}},
     "KHR_node_visibility": {"visible": True},
 }

@@ -10,7 +10,7 @@ import pytest
 
 from tests.gltf_files import TRIANGLE, load_warned, one_triangle, pack_glb
 from tests.refused import refused
-from wrt.io.gltf.document import LeftOut
+from wrt.io.gltf.document import COMPRESSIONS, LeftOut
 from wrt.io.gltf.reader import load_gltf
 from wrt.io.gltf.schema import Needed, read
 
@@ -115,6 +115,15 @@ def test_required_extensions_that_are_not_supported(tmp_path):
     file = one_triangle()
     file.json["extensionsRequired"] = ["KHR_texture_basisu", "KHR_mesh_quantization", "ACME_unheard_of"]
     with refused(what="'ACME_unheard_of', 'KHR_texture_basisu'", place="extensionsRequired", hint="without"):
+        load_gltf(file.write(tmp_path))
+
+
+@pytest.mark.parametrize("name", sorted(COMPRESSIONS))
+def test_a_file_that_requires_compressed_meshes_is_refused_with_a_way_out_and_plain_buffers_are_read(tmp_path, name: str):
+    file = one_triangle(extensions={name: {"bufferView": 0, "attributes": {"POSITION": 0}}})
+    assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1  # without a warning, which would fail the test
+    file.json["extensionsRequired"] = [name, "KHR_mesh_quantization"]
+    with refused(what=f"the file needs '{name}'", place="extensionsRequired", hint="gltf-transform copy IN OUT"):
         load_gltf(file.write(tmp_path))
 
 
