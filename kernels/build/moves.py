@@ -215,8 +215,9 @@ def affine_of(transforms: Transforms, i: int) -> Affine:
         return out
     for k in range(3):
         row = vector(transforms, begin + 4 * k)
-        out.a[k] = wp.vec3d(row[0], row[1], row[2])
         out.t[k] = row[3]
+        for j in range(3):
+            out.a[k, j] = row[j]  # Warp 1.17 assigns no rows of matrices in structs
     return out
 
 

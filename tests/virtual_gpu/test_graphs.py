@@ -27,6 +27,12 @@ def add(x: wp.array(dtype=float), step: float):
     x[wp.tid()] += step
 
 
+@wp.kernel(enable_backward=False)
+def use(t: wp.array(dtype=float), ids: wp.array(dtype=int), hidden: wp.array(dtype=wp.bool), seen: wp.array(dtype=float)):
+    i = wp.tid()
+    seen[i] += wp.where(hidden[i], t[i] + float(ids[i]), -1.0)
+
+
 def test_a_launch_is_recorded_with_its_arguments_and_repeated_by_the_graph() -> None:
     x, y = (wp.zeros(3, dtype=float, device="cuda:0") for _ in range(2))
     wp.launch(add, 3, [x, 1.0], device="cuda:0")
@@ -102,12 +108,16 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
     world = wp.array(np.arange(500) % 2, dtype=wp.int32, device="cuda:0")
     bodies, poses = wp.array([7, 1], dtype=wp.int32, device="cuda:0"), wp.zeros(9, dtype=wp.transformf, device="cuda:0")
     some = wp.zeros(2, dtype=wp.mat44f, device="cuda:0")
-    out = accel.closest_hit(*rays, world=world)
+    out, hidden = accel.closest_hit(*rays, world=world), accel.any_hit(*rays, world=world)
+    seen = wp.zeros(500, dtype=float, device="cuda:0")
 
     def step() -> Hits:
         accel.move(poses)
         accel.move(bodies, some)
-        return accel.closest_hit(*rays, world=world, out=out)
+        hits = accel.closest_hit(*rays, world=world, out=out)
+        accel.any_hit(*rays, t_max=out.t, world=world, out=hidden)
+        wp.launch(use, 500, [out.t, out.prim_id, hidden, seen], device="cuda:0")
+        return hits
 
     step()
     step()
@@ -118,16 +128,16 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
     step()
     with wp.ScopedCapture("cuda:0") as capture:
         hits = step()
-    assert (counts.copies, counts.synchronisations, counts.launches.total(), allocated) == (copies, waits, launches + 5, [])
+    assert (counts.copies, counts.synchronisations, counts.launches.total(), allocated) == (copies, waits, launches + 7, [])
     monkeypatch.undo()
     for _ in range(2):
         quaternions, matrices = rng.normal(size=(9, 4)), np.tile(np.eye(4), (2, 1, 1)) + 0.2 * rng.normal(size=(2, 4, 4))
         matrices[:, 3] = [0.0, 0.0, 0.0, 1.0]
         poses.assign(np.concatenate([0.5 * rng.normal(size=(9, 3)), quaternions], axis=1))
         some.assign(matrices)
-        copies, launches = counts.copies.copy(), counts.launches.total()
+        before, copies, launches = seen.numpy(), counts.copies.copy(), counts.launches.total()
         wp.capture_launch(capture.graph)
-        assert counts.copies == copies and counts.launches.total() == launches + 5
+        assert counts.copies == copies and counts.launches.total() == launches + 7
         expected = wrt.build(worlds, device="cpu")
         expected.move(wp.array(poses.numpy(), dtype=wp.transformf, device="cpu"))
         expected.move(bodies.to("cpu"), some.to("cpu"))
@@ -135,6 +145,7 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
         assert (found.prim_id >= 0).sum() > 50
         for name in FIELDS:
             assert getattr(out, name).numpy().tobytes() == getattr(found, name).tobytes()
+        assert np.array_equal(seen.numpy(), before + np.where(found.t < np.inf, found.t + found.prim_id.astype(np.float32), np.float32(-1)))
         assert hits.instance.numpy().tobytes() == found.instance.tobytes() and hits.point.numpy().tobytes() == found.point.tobytes()
         assert np.array_equal(accel.geometry.to_world, expected.geometry.to_world)
     with pytest.raises(InputError, match="must be on cuda:0"):

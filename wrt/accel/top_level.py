@@ -82,7 +82,7 @@ def launch(kernel: Kernel, data: WarpStruct, ids: WarpArray, *inputs: WarpStruct
     if device.is_cpu and not device.is_capturing:
         launch_raw(kernel, len(ids), data, ids, *inputs, None, threads=threads, step=INSTANCES_PER_JOB)
     else:
-        launch_on(device, kernel, len(ids), data, ids, *inputs, None, captured=device.is_cpu)
+        launch_on(device, kernel, len(ids), data, ids, *inputs, None, captured=True)
 
 
 def transforms_of(numbers: WarpArray | np.ndarray, size: int, device: Device, outside: bool = False) -> WarpStruct:

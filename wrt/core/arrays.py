@@ -45,6 +45,13 @@ def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
     return wp.array(array, dtype=dtype or wp.dtype_from_numpy(array.dtype), device="cpu", copy=not array.flags.writeable)
 
 
+def contiguous(array: Any) -> Any:
+    """Return the Warp array, or a contiguous copy. Raises InputError in a capture on the CPU, because Warp cannot record such a copy."""
+    if not array.is_contiguous:
+        refuse_capture()
+    return array.contiguous()
+
+
 def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
     """Return an argument as a NumPy array of real numbers: integers and floats keep their type, objects become float32.
 

@@ -194,7 +194,8 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool =
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
                          f" on a device can have, 2^31 - 1", hint="a binary tree (bvh2) has the fewest")
-    warp_private.refuse_capture(device if len(array) else None)
+    if len(array):
+        warp_private.refuse_capture(device)
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array)
@@ -279,19 +280,23 @@ def launch(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int 
 
 
 def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0, captured: bool = False) -> None:
-    """Launch a kernel over n elements. captured: a graph of the CPU may capture the launch.
+    """Launch a kernel over n elements. captured: a graph of the CPU may capture the launch, which then has no ranges.
 
     With a step, the CPU launches the kernel once for each range of `step` elements, on `threads` threads. An input of None is replaced
     by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.settings.block_dim threads."""
     if n == 0:
         return
-    if not captured:
+    if not (captured and device.is_cpu):
         warp_private.refuse_capture()
     load_kernel(kernel, device)
-    step = step if step and device.is_cpu else n
+    recorded = device.is_cpu and warp_private.captures_on_cpu()
+    step = step if step and device.is_cpu and not recorded else n
 
     def job(first: int) -> None:
         wp.launch(kernel, dim=min(step, n - first), device=device, inputs=[first if each is None else each for each in inputs],
                   record_tape=False, block_dim=block_dim(device))
 
-    run_all([partial(job, first) for first in range(0, n, step)], threads)
+    if recorded:
+        job(0)  # on this thread: Warp records no launches of others
+    else:
+        run_all([partial(job, first) for first in range(0, n, step)], threads)

@@ -146,20 +146,25 @@ def recording_tape() -> wp.Tape | None:
     return context.runtime.tape
 
 
+def captures_on_cpu() -> bool:
+    """Return True while a graph is captured on the CPU. Warp then records the launches and copies of this thread and runs none."""
+    capture = getattr(context.runtime, "_apic_capture", None)  # None before Warp starts
+    return capture is not None and capture.device.is_cpu
+
+
 def refuse_capture(device: Device | None = None) -> None:
     """Raise InputError, which names the called function of wrt, while a graph is captured on the CPU or on `device`.
 
-    On the CPU, Warp then records launches and copies and runs none. wrt's own launches and NumPy would run at once, on old values."""
-    capture = getattr(context.runtime, "_apic_capture", None)  # None before Warp starts
-    if not (capture is not None and capture.device.is_cpu) and not (device is not None and device.is_cuda and device.is_capturing):
+    Launches that are not Warp's, and NumPy, would run at once, on old values."""
+    if not captures_on_cpu() and not (device is not None and device.is_cuda and device.is_capturing):
         return
     name, frame = "a function of wrt", inspect.currentframe()
     while frame:  # the outermost function of wrt is the one that the user called
         if str(frame.f_globals.get("__name__")).startswith("wrt.") and "<" not in frame.f_code.co_qualname:
             name = frame.f_code.co_qualname
         frame = frame.f_back
-    raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture; a kernel of your own with"
-                     " wrt.ray_query can be captured, and so can what docs/moving.md lists")
+    raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture, or pass contiguous Warp"
+                     " arrays to what docs/moving.md lists; a kernel of your own with wrt.ray_query can be captured, too")
 
 
 # --- kernels and their files ------------------------------------------------------------------------------------------

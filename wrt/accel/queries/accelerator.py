@@ -153,7 +153,7 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        snapshot = self.snapshot  # read once, because a refit may replace it during the query
+        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         query, shape, give = _query(snapshot, HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else arrays_of(out), **options)
         counts = None
@@ -191,7 +191,7 @@ class Accelerator:
         (...) bool
             Array of the rays' shape, of NumPy or of the library of `origins`.
         """
-        snapshot = self.snapshot
+        snapshot = self._snapshot
         query, shape, give = _query(snapshot, ANY_HIT_TYPES, (origins, directions, t_min, t_max), threads,
                                     None if out is None else (out,), **options)
         trace_query(snapshot, query)
@@ -210,6 +210,8 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
     if threads is not None:
         threads = thread_count(threads)
     valid, shape = rays_of(*rays, types is HIT_TYPES, snapshot.geometry.origin, invalid)
+    if not valid.as_warp:
+        refuse_capture()
     form, give, width = ((len(valid.origins),), None, 0) if shape is None else (shape, to_tensor_like(*rays[:2]), tiled_width(shape))
     arrays = answer_arrays(types, out, form, snapshot.device if valid.as_warp else None, give is not None)
     return Query(valid, arrays, threads, check_world(snapshot, world, form), width), shape, give

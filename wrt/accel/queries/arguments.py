@@ -9,7 +9,7 @@ import warp as wp
 from wrt.accel.geometry import InstancedGeometry
 from wrt.accel.queries.rays import LOWEST, Rays, check_ends, constant, filled, from_origin, is_valid, vectors
 from wrt.accel.snapshot import Snapshot
-from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers, to_numpy
+from wrt.core.arrays import check_no_gradients, contiguous, float32, from_tensor, real_numbers, to_numpy
 from wrt.core.checks import as_choice, shown
 from wrt.core.device import to_device, upload
 from wrt.core.errors import InputError
@@ -137,8 +137,8 @@ def _flat(array: Any, shape: Shape, name: str) -> Array:
         sizes = (1,) * (len(shape) - array.ndim) + array.shape
         steps = (0,) * (len(shape) - array.ndim) + array.strides
         array = wp.array(ptr=array.ptr, dtype=array.dtype, shape=shape, device=array.device,
-                         strides=tuple(0 if size == 1 else step for size, step in zip(sizes, steps, strict=True))).contiguous()
-    flat: Array = in_shape(array if array.is_contiguous else array.contiguous(), (n,))
+                         strides=tuple(0 if size == 1 else step for size, step in zip(sizes, steps, strict=True)))
+    flat: Array = in_shape(contiguous(array), (n,))
     return flat
 
 
@@ -160,7 +160,7 @@ def of_each(value: ArrayLike, shape: Shape, name: str, dtype: WarpType = wp.floa
     if isinstance(value, wp.array):
         if value.dtype != dtype or value.shape != (shape or (1,)):
             raise InputError(f"must be {shape} {dtype.__name__}, as the rays, got {value.shape} {value.dtype.__name__}", argument=name)
-        return value if value.ndim == 1 else in_shape(value.contiguous(), (value.size,))
+        return value if value.ndim == 1 else in_shape(contiguous(value), (value.size,))
     array = real_numbers(value, name, f"a number or {shape}")
     if array.ndim == 0:
         return array
@@ -184,7 +184,7 @@ def indices_of(value: ArrayLike, shape: Shape, name: str, low: int, count: int) 
 
 def _without_invalid(rays: Rays) -> Rays:
     """Replace each ray that is not valid by one that hits nothing. Warp arrays are copied to the host to find them."""
-    origins, directions, t_min, t_max = (array.numpy() if isinstance(array, wp.array) else array for array in rays)
+    origins, directions, t_min, t_max = map(to_numpy, rays)
     bad = ~is_valid(origins, directions, t_min, t_max)
     if not bad.any():
         return rays
@@ -228,7 +228,7 @@ def check_world(snapshot: Snapshot, world: ArrayLike | None, shape: Shape) -> Wo
         raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
     ids = indices_of(world, shape, "world", 0, geometry.n_worlds)
     if isinstance(ids, wp.array):
-        ids = to_device(ids if ids.is_contiguous else ids.contiguous(), snapshot.device)
+        ids = to_device(contiguous(ids), snapshot.device)
     else:
         ids = upload(ids, wp.int32, snapshot.device)
     return WorldIds(geometry.world_first_prim, filled(Worlds, (ids, snapshot.roots)))

@@ -10,13 +10,13 @@ import warp as wp
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.queries.arguments import WorldIds
 from wrt.accel.queries.raw_launches import SMALL, FewRows, RowKernel, raw_launch
-from wrt.accel.queries.rays import Rays, constant, filled, rays_on
+from wrt.accel.queries.rays import Rays, arrays_on, constant, filled, rays_on
 from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
 from wrt.core.threads import FreeList, run_all, thread_count
 from wrt.core.types import Array, Device, KernelModule, WarpStruct, WarpType
-from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.core.warp_private import array_record, captures_on_cpu, record_of, struct_record
 from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
 from wrt.kernels.structs import Surfaces
@@ -83,7 +83,8 @@ def trace_query(snapshot: Snapshot, query: Query) -> None:
     if snapshot.device.is_cuda or (query.worlds is not None and not has_stream(snapshot.structure)):
         trace_one_by_one(snapshot, query)
     else:
-        (tracer if query.worlds is None else world_tracer)(snapshot.structure, any_hit).trace(snapshot, query)
+        found = (tracer if query.worlds is None else world_tracer)(snapshot.structure, any_hit)
+        (found.record if captures_on_cpu() else found.trace)(snapshot, query)
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
@@ -138,6 +139,16 @@ class Tracer:
         if refused:
             rays.checked()
 
+    def record(self, snapshot: Snapshot, query: Query) -> None:
+        """Record the trace in the graph that is captured on the CPU: one launch on one thread, with scratch memory of its own.
+
+        The graph keeps all arrays alive."""
+        out, n, worlds = query.out, len(query.out[0]), [] if query.worlds is None else [query.worlds.arrays.id]
+        given = filled(self.rays, [*arrays_on(snapshot.device, query.rays), *worlds])
+        last = [new_scratch(self.sizes), 0, n] if self.stream else [0]
+        launch_on(snapshot.device, self.kernel, min(n, 1) if self.stream else n, snapshot.data, snapshot.surfaces, given,
+                  filled(HitArrays, out) if len(out) > 1 else out[0], *last, captured=True)
+
     def _trace_many(self, snapshot: Snapshot, inputs: Sequence[np.ndarray], results: Sequence[np.ndarray], threads: int,
                     width: int) -> bool:
         """Trace in several launches, in place where that is possible. Return whether a ray was refused."""
@@ -180,7 +191,7 @@ def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
     """Return kernels.wide.packets.Scratch with arrays of these sizes. They begin at cache lines, so that no vector crosses a line."""
     out: WarpStruct = Scratch()
     for (name, kind), size in zip(fields_of(Scratch).items(), sizes, strict=False):
-        setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(kind.dtype))))
+        setattr(out, name, wp.array(empty_aligned(size, wp.dtype_to_numpy(kind.dtype)), kind.dtype, device="cpu", copy=False))
     return out
 
 
@@ -285,7 +296,8 @@ def trace_one_by_one(snapshot: Snapshot, query: Query) -> None:
         there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
                  else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in targets]
         launch_on(device, kernel, len(targets[0]), snapshot.data, snapshot.surfaces, rays_on(device, own), *more,
-                  filled(HitArrays, there) if len(out) > 1 else there[0], None, threads=thread_count(query.threads), step=RAYS_PER_LAUNCH)
+                  filled(HitArrays, there) if len(out) > 1 else there[0], None, threads=thread_count(query.threads), step=RAYS_PER_LAUNCH,
+                  captured=True)
         for array, result in zip(targets, there, strict=True):
             if not isinstance(array, wp.array) and device.is_cuda:
                 array[:] = result.numpy()

@@ -85,7 +85,8 @@ class HitIds(Generic[ArrayT]):
 
     def _source(self, rays: bool = True) -> Source:
         """Return the source. Raises InputError without it, and, if `rays` are needed, without rays."""
-        refuse_capture()
+        if not isinstance(self.prim_id, wp.array):
+            refuse_capture()
         if self.source is None or (rays and self.source[1] is None):
             raise InputError("these hits have no rays, from which distances, points, normals and ids are computed: lists of hits have ids"
                              " alone, copies and pickled hits lose all", hint="ask the result of closest_hit before it is copied")
@@ -117,7 +118,7 @@ class HitIds(Generic[ArrayT]):
         if worlds is not None:
             hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
         inputs = [surfaces, object_ids, rays_on(device, rays) if name in FROM_RAYS else RayArrays(), hits, out]
-        launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
+        launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH, captured=True)
         if to_own is not None:
             array = upload(to_own(array.numpy()), wp.int32, device)
         if name == "error" and origin is not None:  # the sum with the origin is rounded, too

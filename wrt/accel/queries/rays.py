@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.core.arrays import check_no_gradients, float32, real_numbers
+from wrt.core.arrays import check_no_gradients, contiguous, float32, real_numbers
 from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpStruct, WarpType
-from wrt.core.warp_private import keep
+from wrt.core.warp_private import captures_on_cpu, keep
 from wrt.kernels.query import FARTHEST, RayArrays, add_origin, subtract_origin
 from wrt.kernels.warp_private import fields_of
 
@@ -49,11 +49,10 @@ class Rays(NamedTuple):
     def checked(self) -> "Rays":
         """Convert the rays to contiguous float32. Raises InputError for the first value that is not valid.
 
-        If the rays are Warp arrays, only t_min and t_max are checked, and only on the CPU.
+        If the rays are Warp arrays, only t_min and t_max are checked, and only on the CPU outside of captures.
         """
         if self.as_warp:
-            rays: Any = self[:2]
-            origins, directions = (a if a.is_contiguous else a.contiguous() for a in rays)
+            origins, directions = map(contiguous, self[:2])
         else:
             origins = vectors(self.origins, "origins", FARTHEST, MISS)
             directions = vectors(self.directions, "directions", hint=MISS)
@@ -65,7 +64,7 @@ def from_origin(points: Any, origin: np.ndarray | None) -> Any:
     """Return points minus `origin`, subtracted in float64 before they are rounded: NumPy's (N, 3), or Warp's (N,) of vec3 or vec3d."""
     if isinstance(points, wp.array) and (origin is not None or points.dtype == wp.vec3d):
         check_no_gradients("a query of float64 or far from 0", origins=points)
-        return _converted(subtract_origin, points.contiguous(), origin, wp.vec3)
+        return _converted(subtract_origin, contiguous(points), origin, wp.vec3)
     return points if origin is None else points - origin
 
 
@@ -80,7 +79,7 @@ def _converted(kernel: Kernel, points: WarpArray, origin: np.ndarray | None, kin
     out = wp.empty(points.shape, dtype=kind, device=points.device)
     flat = [array.reshape((array.size,)) for array in (points, out)] if points.ndim > 1 else [points, out]
     launch_on(points.device, kernel[points.dtype] if isinstance(kernel, dict) else kernel, out.size, flat[0],
-              wp.vec3d(*(np.zeros(3) if origin is None else origin)), flat[1])
+              wp.vec3d(*(np.zeros(3) if origin is None else origin)), flat[1], captured=True)
     return out
 
 
@@ -146,10 +145,10 @@ def _endless(value: float, sign: float) -> np.ndarray:  # the sign keeps 0.0 and
     return out
 
 
-def _checked_ends(array: Array, name: str) -> Array:
+def _checked_ends(array: Any, name: str) -> Array:
     if isinstance(array, wp.array):
-        array = array if array.is_contiguous else array.contiguous()
-        if array.device.is_cuda:
+        array = contiguous(array)
+        if array.device.is_cuda or captures_on_cpu():
             return array
     elif array.strides != (0,):
         array = float32(array)
