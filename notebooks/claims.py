@@ -7,7 +7,7 @@
 # 3. the bytes that compressed nodes save.
 #
 # In each plot a bar is wrt's count, and a black line is the published value; its title names the source. The scenes and cameras are not
-# those of the papers, so a factor of 1.5 counts as agreement. `python -m wrt bench claims` has all eight claims, and takes the
+# those of the papers, so a factor of 1.5 counts as agreement. `python -m wrt bench claims` repeats the claims, and takes the
 # papers' scenes as files.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.

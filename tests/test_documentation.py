@@ -46,9 +46,7 @@ SLOW = {  # run by `pytest -m slow`
     "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench rtcore": ("--rays", "500",),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
     "bench visibility": ("--size", "64", "--max-size", "64", "--max-triangles", "2000", "--runs", "1"),
-    "bench claims": ("--side", "16", "repacking"),
-    "bench closed": ("--points", "500", "--rays", "500", "--others", "100"),
-    "bench pictures": ("--size", "16x9", "--spp", "1", "--runs", "1"),
+    "bench claims": ("--side", "16", "cwbvh"),
     "bench mitsuba": ("--size", "16x9", "--spp", "1", "--repeats", "3", "--starts", "0"),
 }
 

@@ -1,4 +1,4 @@
-"""A walk of wide trees whose rules are arguments: order of children, culling at the pop, stack or queue; with a log of each ray.
+"""A walk of wide trees whose rules are arguments: order of children, culling at the pop; with a log of each ray.
 
 The walk pushes every child that the ray enters, then pops the next one. So a ray's log tells how many entries waited at each step."""
 
@@ -11,7 +11,7 @@ from wrt.kernels.units.box import ray_aabb
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
 MAX_WIDTH = 8
-QUEUE = wp.constant(2048)  # Entries of a ray's stack or queue.
+STACK = wp.constant(2048)  # Entries of a ray's stack.
 Keys = wp.types.vector(MAX_WIDTH, wp.uint64)
 probe_of, intersect = make_probe(Units()), make_intersect(Units())
 
@@ -39,12 +39,11 @@ class StudyRays:
 
 @wp.struct
 class Rules:
-    """Rules of a walk: 1 or 0 each. ordered: nearest child first, else the slots' order, the last slot first on a stack.
-    culled: drop popped entries behind the best hit. queue: first in, first out (breadth first)."""
+    """Rules of a walk: 1 or 0 each. ordered: nearest child first, else the last slot first. culled: drop popped entries behind the best
+    hit."""
 
     ordered: int
     culled: int
-    queue: int
 
 
 @wp.struct
@@ -55,7 +54,7 @@ class Work:
     leaves: int  # Leaves fetched.
     boxes: int  # Boxes tested.
     tests: int  # Primitives tested.
-    full: int  # 1 if the stack or queue had no room for an entry.
+    full: int  # 1 if the stack had no room for an entry.
     prim_id: int  # The hit, -1 for a miss.
 
 
@@ -82,8 +81,7 @@ def entered_children(tree: StudyTree, node: int, rules: Rules, probe: Probe, t_m
                 key = key_of(t + 0.0, tree.children[at])  # t + 0.0: never -0
                 j = int(n)
                 if rules.ordered != 0:
-                    # On a stack, the nearest child is pushed last; in a queue, first.
-                    while j > 0 and ((keys[j - 1] < key) == (rules.queue == 0)):
+                    while j > 0 and keys[j - 1] < key:  # the nearest child is pushed last
                         keys[j] = keys[j - 1]
                         j = j - 1
                 keys[j] = key
@@ -115,17 +113,16 @@ def write_fetch(log: WalkLog, i: int, work: Work, reference: int, entered: int):
 @kernel
 def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, first_ray: int, scratch: wp.array(dtype=wp.uint64),
          log: WalkLog):
-    """Trace ray first_ray + tid. scratch: QUEUE entries for each thread. A full queue ends the walk, and sets log.work[i].full."""
+    """Trace ray first_ray + tid. scratch: STACK entries for each thread. A full stack ends the walk, and sets log.work[i].full."""
     i = first_ray + wp.tid()
-    base = wp.tid() * QUEUE
+    base = wp.tid() * STACK
     ray = make_ray(rays.origin[i], rays.direction[i])
     ray.t_max = rays.t_max[i]
     probe = probe_of(ray)
     any_hit = rays.any_hit[i] != wp.int8(0)
     best = no_hit(ray)
     work = Work()
-    head = int(0)
-    tail = int(0)  # A stack ends here, and so does a queue, which begins at `head`.
+    size = int(0)
     reference = int(0)
     while True:
         if reference < 0:
@@ -139,21 +136,16 @@ def walk(tree: StudyTree, surfaces: Surfaces, rays: StudyRays, rules: Rules, fir
             for slot in range(tree.width):
                 work.boxes += wp.where(tree.children[reference * tree.width + slot] != EMPTY, 1, 0)
             write_fetch(log, i, work, reference, n)
-            if tail - head + n > QUEUE:
+            if size + n > STACK:
                 work.full = 1
                 break
             for j in range(n):
-                scratch[base + tail % QUEUE] = keys[j]
-                tail = tail + 1
+                scratch[base + size] = keys[j]
+                size = size + 1
         found = bool(False)
-        while tail > head and not found:
-            key = wp.uint64(0)
-            if rules.queue != 0:
-                key = scratch[base + head % QUEUE]
-                head = head + 1
-            else:
-                tail = tail - 1
-                key = scratch[base + tail % QUEUE]
+        while size > 0 and not found:
+            size = size - 1
+            key = scratch[base + size]
             if rules.culled == 0 or t_of(key) <= best.t:
                 reference = reference_of(key)
                 found = True

@@ -22,9 +22,9 @@ from wrt.cli.common import (
 from wrt.cli.reporting import measured
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
-from wrt.lab.bench import Error, Pictures, Queries, Visibility
+from wrt.lab.bench import Error, Queries, Visibility
 from wrt.lab.claims import Claims
-from wrt.lab.hard_cases import Closed, Stability
+from wrt.lab.hard_cases import Stability
 from wrt.lab.mitsuba import Mitsuba
 from wrt.lab.rtcore import MODELLED, RtCore, WhatIf
 
@@ -36,7 +36,7 @@ def bench() -> None:
     """Measure speed and error of renders, and compare methods."""
 
 
-for plan in (Queries, Error, Visibility, Pictures, Closed, Mitsuba, RtCore, Claims):
+for plan in (Queries, Error, Visibility, Mitsuba, RtCore, Claims):
     bench.add_command(measured(plan))
 whatif, stability = measured(WhatIf), measured(Stability)
 

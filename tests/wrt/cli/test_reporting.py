@@ -20,10 +20,10 @@ from click.testing import CliRunner
 from wrt.cli.reporting import measured
 from wrt.core.interrupts import Interrupted
 from wrt.lab import Plan, option
-from wrt.lab.bench import Error, Pictures, Queries, Visibility
+from wrt.lab.bench import Error, Queries, Visibility
 from wrt.lab.bench.report import Columns, Groups, Row
 from wrt.lab.claims import Claims
-from wrt.lab.hard_cases import Closed, Stability
+from wrt.lab.hard_cases import Stability
 from wrt.lab.mitsuba import Mitsuba
 from wrt.lab.rtcore import RtCore, WhatIf
 
@@ -102,7 +102,7 @@ def test_quick_lists_its_smaller_defaults_and_keeps_stated_options() -> None:
     assert "no effect" in run("--quick", "--count", 2).stderr
 
 
-@pytest.mark.parametrize("plan", [Queries, Visibility, Closed, Claims, Error, Pictures, Stability, Mitsuba, RtCore, WhatIf])
+@pytest.mark.parametrize("plan", [Queries, Visibility, Claims, Error, Stability, Mitsuba, RtCore, WhatIf])
 def test_quick_is_less_than_the_default(plan: Any) -> None:
     defaults = {name: plan.__dataclass_fields__[name].default for name in plan.QUICK}
     assert all(plan.QUICK[name] < default for name, default in defaults.items() if not isinstance(default, str | tuple))

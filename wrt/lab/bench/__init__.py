@@ -1,10 +1,10 @@
 """Measurements of speed and error."""
 
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from wrt.lab import STRUCTURES, OnScene, Plan, option, the_device, the_meshes, the_seed, the_threads
+from wrt.lab import STRUCTURES, OnScene, Plan, option, the_device, the_seed, the_threads
 
 QUERY_KINDS = ("primary", "shadow", "diffuse", "random", "inward", "points", "tiles")
 THREAD_CHOICES = ("one", "all", "both")
@@ -53,19 +53,6 @@ class Visibility(Plan):
     max_size: int = option(1024, "Largest side, in pixels, of the sweep over picture sizes, which starts at 64", (64, 16384))
     max_triangles: int = option(1_500_000, "Subdivide surfaces up to this number of triangles", (1, 2**30))
     runs: int = option(7, "Timed runs of each method, alternating", (1, 1000))
-    accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
-
-
-@dataclass(frozen=True)
-class Pictures(Plan):
-    """Render SCENES by waves of samples and one ray at a time. The CPU uses waves. Compare nanoseconds a sample on one thread, and
-    count the pixels that differ (must be 0)."""
-
-    COMMAND, STUDY, QUICK = "bench pictures", "wrt.lab.bench.pictures", {"size": "160x90", "spp": 4, "runs": 3}
-    scenes: Sequence[Any] = the_meshes(MISSING)
-    size: str = option("640x360", "Width x height of each picture, in pixels")
-    spp: int = option(16, "Samples per pixel", (1, 1 << 16))
-    runs: int = option(5, "Timed runs of each way to render, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
 
 

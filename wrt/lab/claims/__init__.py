@@ -13,7 +13,7 @@ class Claims(Plan):
     NAMES: claims; default: all. Without files, generated scenes stand in for the published ones."""
 
     COMMAND, STUDY = "bench claims", "wrt.lab.claims.claim"
-    QUICK = {"side": 48, "names": ("ttp-nodes", "coop-rt", "cwbvh")}
+    QUICK = {"side": 48, "names": ("ttp-nodes", "cwbvh")}
     names: Sequence[str] = option((), of=("claim", "wrt.lab.claims.claim:CLAIMS"))
     scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE",
                                   check="wrt.lab.claims.scenes:scene_files")

@@ -80,9 +80,9 @@ class Study:
         geometry = self.scene(name).geometry
         return self.keep(("six", name), lambda: tree_of(geometry, Bvh6(geometry).decoded()))
 
-    def ttp(self, name: str, workload: str = PATH, rules: Rules = TTP_RULES) -> Walk:
+    def ttp(self, name: str, workload: str = PATH) -> Walk:
         """Return the logged walk of bvh6 by the rays of a workload."""
-        return self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules))
+        return self.keep(("ttp", name, workload), lambda: walk(self.six(name), self.rays(name, workload), TTP_RULES))
 
     def rays(self, name: str, workload: str = PATH) -> Rays:
         return self.scene(name).workloads[workload]
@@ -97,7 +97,7 @@ class Study:
 
 CLAIMS: Registry[Claim] = Registry("claim", {
     name: f"wrt.lab.claims.counted:{name.upper().replace('-', '_')}"
-    for name in ("ttp-nodes", "ttp-breadth", "ttp-queue", "coop-rt", "repacking", "cwbvh", "eight-bits", "machines")},
+    for name in ("ttp-nodes", "coop-rt", "cwbvh", "eight-bits")},
     "wrt.claims")
 
 TITLE = "Published claims, repeated"

@@ -18,8 +18,6 @@ SETUP = ("LumiBench, path tracing, 128 x 128, one sample a pixel, all rays; node
          " unsorted, popped entries not culled; reads of leaves count")
 THEIRS = {"bunny": "144k triangles in a scene of LumiBench", "sponza": "Crytek's, 262k triangles"}
 MEAN, MOST = {"bunny": 11.3, "sponza": 38.0}, {"bunny": 141.0, "sponza": 335.0}
-BREADTH = {"bunny": 10.6, "sponza": 35.5}
-REPACK_BELOW = 22
 NODE, TRIANGLE = (228, 96), (36, 9)  # bytes in float32, and in 8 bits
 
 
@@ -40,37 +38,7 @@ def ttp_nodes(study: Study) -> Iterator[Figure]:
         yield Figure(f"most nodes of a ray, {name}", float(fetches.max()), MOST[name], "nodes", said, kinds)
 
 
-def ttp_breadth(study: Study) -> Iterator[Figure]:
-    """Compare nodes a ray of a queue with those of a stack."""
-    for name in THEIRS:
-        log, breadth = study.ttp(name), study.ttp(name, rules=Rules(False, False, True)).fetches
-        hit = log.counts["prim_id"] >= 0
-        all_rays, hits, misses = (100.0 * float(breadth[rows].mean() / log.fetches[rows].mean() - 1.0) for rows in
-                                  (slice(None), hit, ~hit))
-        yield Figure(f"nodes that breadth first adds, {name}", all_rays, BREADTH[name], "%", study.differences(name, THEIRS[name]),
-                     f"rays that hit {hits:+.0f} %, that miss {misses:+.0f} %; {np.mean(hit):.0%} of the rays hit")
-
-
-def ttp_queue(study: Study) -> Iterator[Figure]:
-    """Count the pops of a queue whose successor already waits, so that it can be prefetched."""
-    shares = []
-    for name in THEIRS:
-        log = study.ttp(name, rules=Rules(False, False, True))
-        before = np.cumsum(log.entered) - log.entered
-        within = np.arange(len(log.fetch)) - log.first[log.owner]
-        waiting = before - before[log.first[log.owner]] - within  # entries in the queue after the pop, before the pushes
-        shares.append(float((waiting > 0).mean()))
-    yield Figure("pops of a queue after which the next entry waits, mean of two scenes", 100.0 * float(np.mean(shares)), 70.42, "%",
-                 f"means of bunny and sponza instead of 16 scenes; {study.differences('sponza', THEIRS['sponza'])}",
-                 f"bunny {shares[0]:.1%}, sponza {shares[1]:.1%}")
-
-
 # --- lanes of warps ---------------------------------------------------------------------------------------------------
-
-def firsts(warp: np.ndarray) -> np.ndarray:
-    """Return the index of each warp's first ray, and the end, (W + 1,) int64. warp: (N,) ascending from 0."""
-    return np.searchsorted(warp, np.arange(int(warp[-1]) + 2)).astype(np.int64)
-
 
 def parents(log: Walk) -> np.ndarray:
     """Return the fetch that pushed each fetch, (M,) int64; -1 for a root. The log must be one of a stack without culling."""
@@ -131,37 +99,6 @@ def coop_rt(study: Study) -> Iterator[Figure]:
                  f" {many.limit}: {many.clocks[many.limit]:.1f}")
 
 
-def repacked(cost: np.ndarray, warp: np.ndarray, below: int = REPACK_BELOW) -> float:
-    """Return the SIMT efficiency if each warp with fewer than `below` active lanes gives up its rays, which form new full warps in turn."""
-    left, group, issued = cost.astype(np.int64), warp.astype(np.int64), 0
-    while len(left):
-        first = firsts(group)
-        sizes = np.diff(first)
-        order = np.lexsort((-left, group))
-        # A warp runs until only below - 1 of its rays are left: as long as its ray of that rank. The very last warp runs to its end.
-        place = first[:-1] + np.minimum(below, sizes) - 1
-        steps = np.where((sizes < below) & (len(sizes) > 1), 0, left[order][np.where(len(sizes) > 1, place, first[:-1])])
-        issued += int(steps.sum())
-        left = left - np.repeat(steps, sizes)
-        left = left[left > 0]
-        group = np.arange(len(left)) // WARP
-    return float(cost.sum() / (WARP * issued))
-
-
-def repacking(study: Study) -> Iterator[Figure]:
-    """Measure SIMT efficiency over whole paths, without and with repacking of rays into full warps."""
-    log, rays = study.ttp("bunny"), study.rays("bunny")
-    said = (f"{study.differences('bunny', '144k triangles')}; SIMT efficiency counts one step a node; the paper's treelet phase is not"
-            " modelled")
-    path = rays.kind == 0  # lanes of paths that have ended idle while the others of their block of pixels go on
-    cost = log.fetches[path]
-    before = float(cost.sum() / (WARP * longest_of(cost.astype(np.float64), rays.warp[path]).sum()))
-    packed = repacked(cost, np.unique(rays.warp[path], return_inverse=True)[1])
-    yield Figure("SIMT efficiency, paths", before, 0.37, "share", said, f"bounces of {np.mean(rays.depth[path] > 0):.0%} of the rays")
-    yield Figure(f"SIMT efficiency with repacking below {REPACK_BELOW} lanes", packed, 0.82, "share", said,
-                 f"repacking lifts {before:.2f} to {packed:.2f}")
-
-
 # --- bytes ------------------------------------------------------------------------------------------------------------
 
 def diffuse(rays: Rays) -> Rays:
@@ -203,42 +140,10 @@ def eight_bits(study: Study) -> Iterator[Figure]:
                  f" {shared[1]:.0f}")
 
 
-# --- whole GPUs -------------------------------------------------------------------------------------------------------
-
-def machines(study: Study) -> Iterator[Figure]:
-    """Compare steps a ray, the use of the test units, and boxes for each triangle with counts on two GPUs by other makers."""
-    rays, core = study.rays("sponza"), GPUS["arcb580"].core
-    part = rays.part(rays.kind == 0)
-    arc = counters_of(build(study.scene("sponza").geometry, "bvh6"), part)
-    boxes, triangles = float(arc.boxes.mean()), float(arc.primitives.mean())
-    said = f"{study.differences('sponza', 'a frame of a game, not shared')}; camera and bounce rays, sorted and culled"
-    numbers = f"bvh6: {arc.nodes.mean():.1f} nodes, {boxes:.1f} boxes and {triangles:.2f} triangles a ray"
-    yield Figure("steps a ray, bvh6", float((arc.nodes + arc.leaves).mean()), 39.5, "nodes", said,
-                 f"{numbers}; without order and culling {study.ttp('sponza').fetches[rays.kind == 0].mean():.1f}")
-    yield Figure("use of the box unit over use of the triangle unit, bvh6", boxes / core.boxes / (triangles / core.triangles), 1.55 / 1.04,
-                 "factor", f"{said}; {core.boxes:g} boxes and {core.triangles:g} triangles a clock", numbers)
-    for width, bits, published, gpu in ((8, 12, 111.76 / 19.61, "RX 9070"), (4, 32, 38.8 / 10.76, "RX 6900 XT")):
-        tree = study.tree("sponza", width, width, bits)
-        here, loose = (walk(tree, part, rules).counts for rules in (Rules(), Rules(False, False)))
-        yield Figure(f"boxes for each triangle, {width} children as {gpu}", here["boxes"].sum() / here["tests"].sum(), published, "factor",
-                     f"{study.differences('sponza', '3DMark DXR feature test')}; own leaves of up to {width} triangles; planes of {bits}"
-                     " bits, no rotated boxes", f"{here['inner'].mean():.1f} nodes, {here['boxes'].mean():.1f} boxes,"
-                     f" {here['tests'].mean():.2f} triangles a ray; without order and culling"
-                     f" {loose['boxes'].sum() / loose['tests'].sum():.1f}")
-
-
 TTP_NODES = Claim(f"{TTP}, Table I", SETUP, "read", ttp_nodes)
-TTP_BREADTH = Claim(f"{TTP}, Table I", f"{SETUP}; a queue in place of the stack", "read", ttp_breadth)
-TTP_QUEUE = Claim(f"{TTP}, Figure 7", f"{SETUP}; a queue in place of the stack; mean of 16 scenes", "read", ttp_queue)
 COOP_RT = Claim("Tozlu, Zhou: CoopRT, ISCA 2025, doi 10.1145/3695053.3731118, Figures 9, 10 and 17",
                 "RTX 2060 model: 30 SMs, L1 64 KB, L2 3 MB, 256 x 256, one sample; mean of LumiBench", "quoted", coop_rt)
-REPACKING = Claim("Chou, Nowicki, Aamodt: Treelet queues, ASPLOS 2025, doi 10.1145/3676641.3716279, Figures 11 and 13",
-                  "16 SMs, L1 16 KB, L2 128 KB, one warp a unit, 256 x 256, 3 bounces; bunny of 144.1k triangles; mean of the scenes",
-                  "quoted", repacking)
 CWBVH = Claim("Ylitie, Karras, Laine: Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs, HPG 2017, abstract",
               "8 children in 80 bytes; memory over that of an uncompressed tree", "abstract", cwbvh)
 EIGHT_BITS = Claim("Grauer, Hanika, Dachsbacher, arXiv 2505.24653 (2025)", "8 children, 8 bits for boxes and triangles, streams of rays",
                    "quoted", eight_bits)
-MACHINES = Claim("Chips and Cheese: Intel Arc B580 (2025-03), AMD RX 9070 (2025-04)",
-                 "hardware counters: Arc 39.5 steps a ray, box and triangle units in use 1.55 and 1.04 %; RX 9070 111.76 to 19.61 and RX"
-                 " 6900 XT 38.8 to 10.76 box and triangle tests", "read", machines)

@@ -16,9 +16,8 @@ from wrt.core.errors import InputError
 from wrt.core.types import WarpStruct
 from wrt.kernels.structs import Primitive, Surfaces
 from wrt.kernels.study import tree_walk as kernels
-from wrt.kernels.study.tree_walk import QUEUE
+from wrt.kernels.study.tree_walk import STACK
 from wrt.kernels.traverse.common import Units
-from wrt.lab.rtcore.whatif import quantised
 
 RAYS_PER_LAUNCH = 2048
 
@@ -58,7 +57,6 @@ class Rules(NamedTuple):
 
     ordered: bool = True
     culled: bool = True
-    queue: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,25 +91,25 @@ def tree_of(geometry: Geometry, wide: WideTree) -> Tree:
 
 
 def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: int = 32) -> Tree:
-    """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits: of a plane of a box, rounded outwards; 8: in the
-    nodes of bvh8c (width 2 to 8, even); 32: float32."""
+    """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits of a plane of a box: 32 (float32), or 8, rounded
+    outwards, as in the nodes of bvh8c (width 2 to 8, even)."""
     options = BvhOptions(max_leaf=max_leaf, cost_traversal=0.0, row=width)
     wide = collapse(build_binary(geometry, options, 1), width, max_leaf, 1.0, 1.0)
-    if bits < 32:
-        lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width) if bits == 8 else quantised(wide.lo, wide.hi, bits)[:2]
+    if bits == 8:
+        lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width)
         wide = WideTree(np.ascontiguousarray(lo), np.ascontiguousarray(hi), wide.children, wide.order, wide.leaves, wide.depth)
     return tree_of(geometry, wide)
 
 
 def walk(tree: Tree, rays: Rays, rules: Rules) -> Walk:
-    """Trace rays by `rules`, once to count and once with a log. Raise InputError if a queue needs more than QUEUE entries."""
+    """Trace rays by `rules`, once to count and once with a log. Raise InputError if a stack needs more than STACK entries."""
     cpu, n, given = start("cpu"), len(rays), kernels.StudyRays()
     given.origin, given.direction = (upload(np.ascontiguousarray(each), wp.vec3, cpu) for each in (rays.origins, rays.directions))
     given.t_max = upload(rays.t_max.astype(np.float32), wp.float32, cpu)
     given.any_hit = upload((rays.kind == 1).astype(np.int8), wp.int8, cpu)
     device_rules, out = kernels.Rules(), wp.zeros(n, dtype=kernels.Work, device=cpu)
-    device_rules.ordered, device_rules.culled, device_rules.queue = map(int, rules)
-    scratch = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.uint64, device=cpu)
+    device_rules.ordered, device_rules.culled = map(int, rules)
+    scratch = wp.empty(RAYS_PER_LAUNCH * int(STACK), dtype=wp.uint64, device=cpu)
 
     def trace(record: WarpStruct) -> np.ndarray:
         record.work = out
@@ -120,7 +118,7 @@ def walk(tree: Tree, rays: Rays, rules: Rules) -> Walk:
 
     counts = trace(kernels.WalkLog())
     if counts["full"].any():
-        raise InputError(f"a ray needs more than {int(QUEUE)} entries in its queue")
+        raise InputError(f"a ray needs more than {int(STACK)} entries in its stack")
     first = np.concatenate([[0], np.cumsum(counts["inner"].astype(np.int64) + counts["leaves"])])
     record = kernels.WalkLog()
     record.fetch_first = upload(first, wp.int64, cpu)

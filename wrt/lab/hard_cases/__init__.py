@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from wrt.lab import Plan, option, the_meshes, the_seed
+from wrt.lab import Plan, option, the_seed
 
 
 @dataclass(frozen=True)
@@ -22,18 +21,3 @@ class Stability(Plan):
     sample: int = option(10_000, "Number of these rays that the oracle judges, and that the other contestants trace", (1, 2**40))
     seed: int = the_seed()
     runs: int = option(7, "Timed runs of each contestant, alternating", (1, 1000))
-
-
-@dataclass(frozen=True)
-class Closed(Plan):
-    """Test which points are inside of closed meshes. Rays through corners and edges must cross an even number of times.
-    Open3D and trimesh answer too, if installed.
-
-    MESHES: closed mesh files, in addition to seven built-in meshes."""
-
-    COMMAND, STUDY, QUICK = "bench closed", "wrt.lab.hard_cases.crossings", {"points": 1000, "rays": 1000, "others": 1000}
-    meshes: Sequence[Any] = the_meshes()
-    points: int = option(10_000, "Number of points for each mesh", (1, 2**28))
-    rays: int = option(10_000, "Number of rays for each mesh", (1, 2**28))
-    others: int = option(10_000, "Most points and rays for another library; 0: none", (0, 2**28))
-    seed: int = option(0, "Seed of the random points and rays")
