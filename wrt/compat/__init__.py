@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-_MODULES = ("open3d", "pyvista", "trimesh")
+_MODULES = ("newton", "open3d", "pyvista", "trimesh")
 
 
 def __getattr__(name: str) -> ModuleType:
