@@ -25,6 +25,7 @@ from tests.gltf_files import GltfFile
 from tests.wrt.lab.rtcore.test_profiler import MIRRORS
 from wrt.cli.main import cli
 from wrt.io.mesh_file import load_mesh
+from wrt.scene.shapes import icosphere
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # dated: their commands and Python are not run
@@ -174,6 +175,9 @@ def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Pat
         Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # a scene whose counting kernel other tests compile, too
     if "--cluster" in words or any("cuda" in word for word in words):
         pytest.skip("needs a scheduler (test_dask.py has one), or GPUs")
+    if "--check" in words:  # tests/test_bits.py compares the other scenes
+        monkeypatch.setattr("wrt.lab.device_check.MESHES", {"ball": icosphere})
+        words = (*words, "--scene", "scenes/whitted.toml")
     result = run(*words)
     assert result.code == 0, result.err
 
@@ -224,7 +228,6 @@ def test_calls_in_the_tables_for_other_libraries_run(theirs: str, folder: Path, 
     import trimesh
 
     import wrt
-    from wrt.scene.shapes import icosphere
 
     shutil.copytree(folder, tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
