@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from functools import cache
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.accel.queries.rays import from_origin
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.tensors import HitTensors, hits_of
 from wrt.core.arrays import to_numpy
 from wrt.core.packages import needed_by
@@ -31,7 +33,9 @@ def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, dir
     accel : OneMesh
         Structure over one mesh without spheres.
     vertices : (V, 3) tensor or None
-        Vertices of the mesh. If they differ from the structure's vertices, the structure is refitted to them. None: no refit.
+        Vertices of the mesh. If they differ from the structure's vertices, the structure is refitted to them. None: no refit. The values
+        of a tensor are read again only if its version has changed, which PyTorch counts: not after writes to its memory by NumPy, Warp or
+        `.data`; pass a clone then.
     origins, directions, t_min, t_max
         See `Accelerator.closest_hit`; tensors on the CPU or a GPU, converted to float32.
     rebuild_at : float
@@ -48,6 +52,19 @@ def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, dir
     return HitTensors(*_function().apply(accel, rebuild_at, t_min, t_max, *inputs))
 
 
+# By snapshot, the tensor of its vertices and that tensor's version. The tensor is kept, so that no other tensor gets its address.
+_followed: WeakKeyDictionary[Snapshot, tuple[Tensor, int]] = WeakKeyDictionary()
+
+
+def _has_vertices(snapshot: Snapshot, vertices: Tensor) -> bool:
+    """Return whether the snapshot was made from these vertices, by their version."""
+    if snapshot not in _followed or snapshot.changes or vertices.is_inference():
+        return False
+    (kept, version), same = _followed[snapshot], ("dtype", "device", "shape")
+    return (vertices.data_ptr(), vertices.stride(), vertices._version) == (kept.data_ptr(), kept.stride(), version) and all(
+        getattr(vertices, name) == getattr(kept, name) for name in same)
+
+
 @cache
 def _function() -> Any:  # a subclass of torch.autograd.Function
     import torch
@@ -57,7 +74,10 @@ def _function() -> Any:  # a subclass of torch.autograd.Function
 
     def forward(ctx: Any, accel: OneMesh, rebuild_at: float, t_min: Any, t_max: Any, *inputs: Any) -> tuple[Any, ...]:
         vertices, *rays = (each if each is None else as_it_is_on_cpu(each).detach().contiguous() for each in inputs)
-        hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
+        known = vertices is None or (isinstance(accel, OneMesh) and _has_vertices(accel.snapshot, inputs[0]))
+        hits = hits_of(accel, None if known else vertices, (*rays, t_min, t_max), rebuild_at)
+        if vertices is not None and not inputs[0].is_inference():
+            _followed[hits.source[0]] = inputs[0].detach(), inputs[0]._version  # type: ignore[index]
         ctx.geometry = hits.source[0].mesh  # type: ignore[index]
         ctx.input_types = [each if each is None else (each.device, each.dtype) for each in inputs]
         ctx.set_materialize_grads(False)

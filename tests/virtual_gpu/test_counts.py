@@ -1,4 +1,4 @@
-"""The numbers of launches, copies and waits for a picture and a query on a GPU, and the bytes between host and device."""
+"""The numbers of launches, copies, waits and allocations of calls on a GPU, and the bytes between host and device."""
 
 from __future__ import annotations
 
@@ -28,11 +28,20 @@ FILM = 52 * PIXELS  # bytes
 
 @contextmanager
 def counted() -> Iterator[SimpleNamespace]:
-    """Count launches, waits, copies and their bytes in the block; the numbers are set at its end."""
-    counts = gpus().counts
+    """Count launches, waits, allocations, copies and their bytes in the block; the numbers are set at its end."""
+    counts, allocate = gpus().counts, gpus().memory.allocate
     launches, copies, size, waits = counts.launches.copy(), counts.copies.copy(), counts.bytes.copy(), counts.synchronisations
-    out = SimpleNamespace()
-    yield out
+    out = SimpleNamespace(allocations=0)
+
+    def allocated(*sizes: int) -> int:
+        out.allocations += 1
+        return allocate(*sizes)
+
+    gpus().memory.allocate = allocated
+    try:
+        yield out
+    finally:
+        gpus().memory.allocate = allocate
     out.launches, out.waits = (counts.launches - launches).total(), counts.synchronisations - waits
     out.copies, out.bytes = dict(counts.copies - copies), dict(counts.bytes - size)
 
@@ -101,3 +110,55 @@ def test_parts_fit_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpus().memory, "limit", gpus().memory.limit - there.free_memory + 30_000)
     assert batches.rays_on_gpu(10, there) == batches.MOST_ON_GPU
     assert batches.rays_on_gpu(1 << 26, there) == batches.FEWEST
+
+
+def costs(page: str) -> dict[str, list[int]]:
+    """Return the table of calls and their costs on a GPU in docs/moving.md."""
+    table = page[page.index("| call on a GPU |"):].partition("\n\n")[0].splitlines()[2:]
+    rows = ([cell.strip() for cell in row.strip("|").split("|")] for row in table)
+    return {name.replace("`", ""): [int(cell) for cell in cells] for name, *cells in rows}
+
+
+def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
+    """Each call is counted the second time, because the first loads kernels and makes what later calls share."""
+    ball = shapes.icosphere(2)
+    points, larger = (wp.array(scale * ball.vertices, dtype=wp.vec3, device="cuda:0") for scale in (1.0, 2.0))
+    mesh = wrt.DeviceGeometry(points, wp.array(ball.faces.reshape(-1), dtype=wp.int32, device="cuda:0"))
+    bvh2 = [wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0") for _ in range(2)]
+    bvh8 = wrt.build(ball, device="cuda:0")
+    worlds, in_place = (wrt.build([wrt.Scene.of([ball] * n) for n in (1, 2)], device="cuda:0") for _ in range(2))
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    poses = wp.array(matrices, dtype=wp.mat44f, device="cuda:0")
+    rays = [wp.array(array, dtype=wp.vec3, device="cuda:0") for array in some_rays()]
+    ids = np.arange(N, dtype=np.int32) % 2
+    world = wp.array(ids, dtype=wp.int32, device="cuda:0")
+    out, of_worlds, t = bvh8.closest_hit(*rays), worlds.closest_hit(*rays, world=world), wp.full(N, 5.0, dtype=float, device="cuda:0")
+    moved = wrt.build(wrt.Scene.of([ball] * 3), movable=True, device="cuda:0").closest_hit(*rays)
+    calls = {
+        'wrt.build(geometry, "bvh2", builder="lbvh")': lambda: wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0"),
+        "wrt.build(mesh)": lambda: wrt.build(ball, device="cuda:0"),
+        "bvh2.refit(points)": lambda: bvh2[0].refit(larger),
+        "bvh2.refit(points, in_place=True)": lambda: bvh2[1].refit(larger, in_place=True),
+        "bvh8.refit(points)": lambda: bvh8.refit(larger),
+        "worlds.move(rows, matrices) of NumPy": lambda: worlds.move(np.arange(3), matrices),
+        "worlds.move(poses)": lambda: in_place.move(poses),
+        "closest_hit(o, d, out=hits)": lambda: bvh8.closest_hit(*rays, out=out),
+        "closest_hit(o, d, t_min, t_max, out=hits)": lambda: bvh8.closest_hit(*rays, 0.25, 7.0, out=out),
+        "closest_hit(o, d, t_max=t, world=ids, out=hits)": lambda: in_place.closest_hit(*rays, t_max=t, world=world, out=of_worlds),
+        "closest_hit(o, d, world=ids) of NumPy": lambda: in_place.closest_hit(*rays, world=ids, out=of_worlds),
+        "any_hit(o, d)": lambda: bvh8.any_hit(*rays),
+        "wrt.count_hits(accel, o, d)": lambda: wrt.count_hits(bvh8, *rays),
+        "wrt.all_hits(accel, o, d)": lambda: wrt.all_hits(bvh8, *rays),
+        "hits.point": lambda: out.point,
+        "hits.instance, hits.object": lambda: moved.instance,
+        "hits.object over worlds": lambda: of_worlds.object,
+    }
+    found = {}
+    for name, call in calls.items():
+        call()
+        with counted() as it:
+            call()
+        found[name] = [it.launches, it.copies.get("h2d", 0), it.copies.get("d2h", 0), it.allocations]
+        assert it.waits == 0
+    print("\n".join(f"| `{name}` | {' | '.join(map(str, row))} |" for name, row in found.items()))
+    assert found == costs((ROOT / "docs/moving.md").read_text(encoding="utf-8"))

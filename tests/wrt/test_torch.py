@@ -13,6 +13,7 @@ import pytest
 import wrt
 from tests.data import ROOT
 from tests.wrt.accel.queries.test_gradients import N, cotangents, facing, rays, soup
+from wrt.accel import tensors
 from wrt.core.errors import InputError
 from wrt.scene import shapes
 
@@ -100,6 +101,32 @@ def test_vertices_that_are_written_to_are_followed() -> None:
             found = wrt.torch.closest_hit(accel, vertices, o, d)
             expected = wrt.build((vertices.clone(), ball.faces)).closest_hit(o, d)
             assert (expected.prim_id >= 0).any() and torch.equal(found.t, expected.t)
+
+
+def test_values_of_vertices_are_read_once_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch = pytest.importorskip("torch", reason=MISSING.format("torch"))
+    ball, (o, d) = shapes.icosphere(2), map(torch.tensor, rays(np.random.default_rng(12), 50))
+    accel, vertices, seen = wrt.build(ball), torch.tensor(ball.vertices), list[int]()
+    read = tensors.at_vertices
+    monkeypatch.setattr(tensors, "at_vertices", lambda *args: (seen.append(1), read(*args))[1])
+
+    def reads(given: Any) -> int:
+        before = len(seen)
+        found = wrt.torch.closest_hit(accel, given, o, d)
+        expected = wrt.build((given.detach().numpy().copy(), ball.faces)).closest_hit(o, d)
+        assert (expected.prim_id >= 0).any() and torch.equal(found.t, expected.t)
+        return len(seen) - before
+
+    assert [reads(vertices), reads(vertices), reads(vertices.detach().requires_grad_())] == [1, 0, 0]
+    vertices *= 1.25
+    assert [reads(vertices), reads(vertices), reads(vertices.clone())] == [1, 0, 1]
+    assert [reads(0.5 * vertices), reads(2.0 * vertices), reads(vertices.double())] == [1, 1, 1]  # of new tensors, versions are 0
+    reads(vertices)
+    accel.refit(3.0 * ball.vertices)  # not by this tensor
+    assert [reads(vertices), reads(vertices)] == [1, 0]
+    with torch.inference_mode():  # which counts no versions
+        other = 0.75 * vertices
+        assert [reads(other), reads(other)] == [1, 1]
 
 
 def test_what_the_page_says_runs() -> None:
