@@ -1,30 +1,34 @@
 """Rays among the shapes of a simulation: poses of shapes from those of bodies, and answers by shape."""
 
-from typing import Any
-
 import warp as wp
 
 from wrt.kernels.structs import kernel
 
 
 @wp.struct
+class Shapes:
+    """Shapes in a structure over worlds; an instance is a shape in a world."""
+
+    shape: wp.array(dtype=wp.int32)  # The simulation's index of each instance's shape.
+    first_instance: wp.array(dtype=wp.int32)  # First instance of each world and, last, the number of instances.
+    first_prim: wp.array(dtype=wp.int32)  # prim_id of each instance's first face, counted in its world.
+
+
+@wp.struct
 class Answers:
-    """Answers of rays; arrays of length 0 are not wanted. Then the values on a miss."""
+    """Answers of rays; arrays of length 0 are not wanted."""
 
     distance: wp.array(dtype=wp.float32)
     normal: wp.array(dtype=wp.vec3)
-    shape: wp.array(dtype=wp.int32)  # Found: the instance, -1 on a miss. Wanted: the simulation's index of its shape.
-    no_distance: float
-    no_normal: wp.vec3
-    no_shape: int
+    shape: wp.array(dtype=wp.int32)
 
 
 @kernel
-def place_shapes(shape_of: wp.array(dtype=wp.int32), shape_body: wp.array(dtype=wp.int32), shape_pose: wp.array(dtype=wp.transformf),
+def place_shapes(shapes: Shapes, shape_body: wp.array(dtype=wp.int32), shape_pose: wp.array(dtype=wp.transformf),
                  body_pose: wp.array(dtype=wp.transformf), poses: wp.array(dtype=wp.transformf), first: int):
     """Write the poses of instances. shape_pose: in the space of the shape's body; body -1 is the world."""
     i = first + wp.tid()
-    shape = shape_of[i]
+    shape = shapes.shape[i]
     pose = shape_pose[shape]
     if shape_body[shape] >= 0:
         pose = wp.transform_multiply(body_pose[shape_body[shape]], pose)
@@ -38,21 +42,23 @@ def known_worlds(given: wp.array(dtype=wp.int32), count: int, world: wp.array(dt
     world[i] = wp.where(given[i] == -1, count, wp.where(given[i] < count, given[i], -1))
 
 
-@wp.func
-def write(out: wp.array(dtype=Any), i: int, found: wp.array(dtype=Any), hit: bool, miss: Any):
-    if out.shape[0] > 0:
-        out[i] = miss
-        if hit:
-            out[i] = found[i]
-
-
 @kernel
-def write_answers(found: Answers, shape_of: wp.array(dtype=wp.int32), out: Answers, first: int):
+def write_answers(shapes: Shapes, world: wp.array(dtype=wp.int32), found: Answers, out: Answers, first: int):
+    """Write the answers that are wanted. found.shape: prim_ids."""
     i = first + wp.tid()
-    instance = found.shape[i]
-    write(out.distance, i, found.distance, instance >= 0, out.no_distance)
-    write(out.normal, i, found.normal, instance >= 0, out.no_normal)
+    prim_id = found.shape[i]
     if out.shape.shape[0] > 0:
-        out.shape[i] = out.no_shape
-        if instance >= 0:
-            out.shape[i] = shape_of[instance]
+        out.shape[i] = -1
+        if prim_id >= 0:
+            low = shapes.first_instance[world[i]]  # the last instance whose first face is not after the hit's
+            high = shapes.first_instance[world[i] + 1]
+            while high - low > 1:
+                middle = (low + high) / 2
+                after = shapes.first_prim[middle] > prim_id
+                low = wp.where(after, low, middle)
+                high = wp.where(after, middle, high)
+            out.shape[i] = shapes.shape[low]
+    if out.distance.shape[0] > 0:
+        out.distance[i] = wp.where(prim_id >= 0, found.distance[i], -1.0)
+    if out.normal.shape[0] > 0:
+        out.normal[i] = wp.where(prim_id >= 0, found.normal[i], wp.vec3())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
+from wrt.accel.queries.rays import filled
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy
 from wrt.core.checks import as_integer, shown
@@ -16,7 +17,7 @@ from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError, warn
 from wrt.core.threads import thread_count
 from wrt.io.gltf.meshes import compose
-from wrt.kernels.shape_rays import Answers, known_worlds, place_shapes, write_answers
+from wrt.kernels.shape_rays import Answers, Shapes, known_worlds, place_shapes, write_answers
 from wrt.scene import shapes
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene
@@ -32,7 +33,7 @@ RAYS = {"ray_origins": wp.vec3, "ray_directions": wp.vec3, "ray_worlds": wp.int3
 RESULTS = {"out_dist": wp.float32, "out_normal": wp.vec3, "out_shape_id": wp.int32}  # in the order of kernels.shape_rays.Answers
 
 
-def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 128, **options: Any) -> ModelShapes:
+def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 128, **options: Any) -> ModelScene:
     """Build a structure over the shapes of all worlds of a Newton Model (1.8), on the model's device.
 
     Boxes, planes, meshes, convex meshes and height fields are exact, but endless planes are squares of 20 km. Spheres, capsules, cylinders,
@@ -47,11 +48,6 @@ def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 12
         Mask of newton.ShapeFlags, as of `Model.bvh_build_shapes`: by default VISIBLE. A shape with opacity 0 is not visible.
     segments, **options
         Edges of the circles of curved shapes, 8 to 4096. Others: see `wrt.build`.
-
-    Returns
-    -------
-    ModelShapes
-        Structure that follows the states of the simulation.
 
     Raises
     ------
@@ -68,7 +64,7 @@ def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 12
     meshes = _meshes(model, chosen.tolist(), as_integer(segments, "segments", 8, 4096))
     if not meshes:
         raise InputError("has no shape that can be traced", argument="model", hint="shape_flags selects the shapes")
-    return ModelShapes(model, meshes, options)
+    return ModelScene(model, meshes, options)
 
 
 def _turned(kind: str, size: np.ndarray, segments: int) -> Mesh:
@@ -122,7 +118,7 @@ def _meshes(model: newton.Model, chosen: list[int], segments: int) -> dict[int, 
     return {shape: mesh for shape in chosen if (mesh := known[shape]) is not None}
 
 
-class ModelShapes:
+class ModelScene:
     """The shapes of a Newton Model, made by `from_newton`. `accel` is the structure over its worlds, and a last one of the shapes that all
     worlds share (world -1). `shape`, (I,) int32, is the index of the model's shape for each value of `hits.instance`."""
 
@@ -131,13 +127,14 @@ class ModelShapes:
         seen, world = np.array(list(meshes)), model.shape_world.numpy()
         rows = [seen[(world[seen] == each) | (world[seen] < 0)] for each in range(model.world_count)] + [seen[world[seen] < 0]]
         self.shape = np.concatenate(rows).astype(np.int32)
-        self._shape_of = upload(self.shape, wp.int32, self.device)
+        self._shapes = filled(Shapes, [upload(self.shape, wp.int32, self.device)])
         self._poses = wp.empty(len(self.shape), dtype=wp.transformf, device=self.device)
         self._place(model)
-        poses = self._poses.numpy().astype(np.float64)
-        place = iter(compose(poses[:, :3], poses[:, 3:], np.ones((len(poses), 3))))
+        place = iter(compose((at := self._poses.numpy().astype(np.float64))[:, :3], at[:, 3:], np.ones((len(at), 3))))
         self.accel = build([Scene(tuple(Object(meshes[shape], transform=next(place)) for shape in each.tolist())) for each in rows],
                            device=str(self.device), **options)
+        first = self.accel.geometry.first_instance, self.accel.geometry.first_prim_in_world
+        self._shapes.first_instance, self._shapes.first_prim = (upload(each, wp.int32, self.device) for each in first)
         self.accel.move(self._poses)  # the first move in place makes arrays
 
     def _launch(self, kernel: Any, n: int, *inputs: object) -> None:
@@ -145,7 +142,7 @@ class ModelShapes:
 
     def _place(self, state: Any) -> None:
         bodies = wp.empty(0, dtype=wp.transformf, device=self.device) if state.body_q is None else state.body_q
-        self._launch(place_shapes, len(self.shape), self._shape_of, self.model.shape_body, self.model.shape_transform, bodies, self._poses)
+        self._launch(place_shapes, len(self.shape), self._shapes, self.model.shape_body, self.model.shape_transform, bodies, self._poses)
 
     def follow(self, state: Any) -> None:
         """Move all shapes to the poses of bodies, in place. Rays miss a shape whose pose is NaN (`accel.invalid_moves`).
@@ -159,7 +156,7 @@ class ModelShapes:
         self.accel.move(self._poses)
 
     def _checked(self, shape: tuple[int, ...], kinds: dict[str, Any], given: dict[str, Any]) -> list[WarpArray | None]:
-        """Return the given arrays as flat arrays in the order of `kinds`, the types by name; None for those that are not given.
+        """Return the given arrays in the order of `kinds`, the types by name; None for those that are not given.
         Raises InputError for other names, and for what is no contiguous Warp array of this type and shape on the device."""
         for name, array in given.items():
             if name not in kinds:
@@ -168,7 +165,7 @@ class ModelShapes:
                     and (array.dtype, array.shape, array.device) == (kinds[name], shape, self.device)):
                 form = f"{shape} of {kinds[name].__name__} on {self.device}"
                 raise InputError(f"must be a contiguous Warp array {form}, got {shown(array)}", argument=name)
-        return [given[name].reshape((given[name].size,)) if name in given else None for name in kinds]
+        return [given.get(name) for name in kinds]
 
     def intersect_ray(self, *, ray_origins: WarpArray, ray_directions: WarpArray, ray_worlds: WarpArray, enable_global_world: bool = True,
                       fast_math: bool = True, **out: WarpArray | None) -> None:
@@ -188,14 +185,11 @@ class ModelShapes:
         """
         if not enable_global_world:
             raise InputError("must be True: world -1 is part of every world", argument="enable_global_world")
-        shape, found, wanted = tuple(getattr(ray_origins, "shape", ()))[:1], Answers(), Answers()
-        rays = {"ray_origins": ray_origins, "ray_directions": ray_directions, "ray_worlds": ray_worlds}
-        origins, directions, worlds = self._checked(shape, RAYS, rays)
-        out = {name: array for name, array in out.items() if array is not None}
-        wanted.distance, wanted.normal, wanted.shape = self._checked(shape, RESULTS, out)
-        wanted.no_distance, wanted.no_shape = -1.0, -1
+        shape = tuple(getattr(ray_origins, "shape", ()))[:1]
+        rays = self._checked(shape, RAYS, dict(zip(RAYS, (ray_origins, ray_directions, ray_worlds), strict=True)))
+        wanted = self._checked(shape, RESULTS, {name: array for name, array in out.items() if array is not None})
         world = wp.empty(shape, dtype=wp.int32, device=self.device)
-        self._launch(known_worlds, len(world), worlds, self.model.world_count, world)
-        hits: Any = self.accel.closest_hit(cast(Any, origins), directions, world=world)
-        found.distance, found.normal, found.shape = hits.t, hits.shading_normal if "out_normal" in out else None, hits.instance
-        self._launch(write_answers, len(world), found, self._shape_of, wanted)
+        self._launch(known_worlds, len(world), rays[2], self.model.world_count, world)
+        hits: Any = self.accel.closest_hit(cast(Any, rays[0]), rays[1], world=world)
+        found = hits.t, None if wanted[1] is None else hits.shading_normal, hits.prim_id
+        self._launch(write_answers, len(world), self._shapes, world, filled(Answers, found), filled(Answers, wanted))

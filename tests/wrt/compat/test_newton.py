@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from tests.refused import refused
-from wrt.compat.newton import ModelShapes, from_newton
+from wrt.compat.newton import ModelScene, from_newton
 from wrt.core.errors import SceneWarning
 from wrt.io.gltf.meshes import compose
 from wrt.scene import shapes
@@ -77,10 +77,10 @@ def rays_of(n: int, worlds: int = WORLDS) -> tuple[Any, Any, Any]:
 
 
 def cast(caster: Any, rays: tuple[Any, Any, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distances, shapes and normals of rays by newton.intersect_ray, or of a ModelShapes."""
+    """Return distances, shapes and normals of rays by newton.intersect_ray, or of a ModelScene."""
     out = wp.zeros(len(rays[0]), dtype=float), wp.zeros(len(rays[0]), dtype=wp.int32), wp.zeros(len(rays[0]), dtype=wp.vec3)
     names = dict(zip(("ray_origins", "ray_directions", "ray_worlds", "out_dist", "out_shape_id", "out_normal"), (*rays, *out), strict=True))
-    if isinstance(caster, ModelShapes):
+    if isinstance(caster, ModelScene):
         caster.intersect_ray(**names)
     else:
         newton.intersect_ray(caster, fast_math=False, **names)
