@@ -59,14 +59,6 @@ def test_pixels_have_the_bits_of_the_cpu(scene: Path) -> None:
     assert there.aov["depth"].tobytes() == here.aov["depth"].tobytes()
 
 
-def test_two_devices_share_a_picture() -> None:
-    one = wrt.render(SCENE, device="cuda:0", **PICTURE)
-    before = gpus().counts.launches.copy()
-    two = wrt.render(SCENE, devices=["cuda:0", "cuda:1"], tile_size=16, **PICTURE)
-    assert {number for _, number in gpus().counts.launches - before} == {0, 1}
-    assert np.array_equal(one.pixels, two.pixels) and one.pixels.max() > 0.0
-
-
 def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> None:
     origins, directions = bits.primary_rays(16, 9)
     mesh, ends = shapes.icosphere(1), np.linspace(1.0, 9.0, len(origins), dtype=np.float32)

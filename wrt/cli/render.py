@@ -27,7 +27,6 @@ from wrt.cli.common import (
 )
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, held_interrupts
-from wrt.core.settings import DEFAULT_DEVICE
 from wrt.io.meshes import SUFFIXES
 
 if TYPE_CHECKING:
@@ -40,9 +39,7 @@ if TYPE_CHECKING:
 @shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Picture to write: .png, .exr, .hdr, .jpg or .webp  [default: the scene's file name with .png]")
-@shared("spp", "size", "seed")
-@click.option("--device", default=DEFAULT_DEVICE, show_default=True,
-              help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
+@shared("spp", "size", "seed", "device")
 @click.option("--cluster", metavar="ADDRESS",
               help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 @shared("threads", "crop", "camera", "max_depth", "min_throughput", "clamp", "filter", "fresnel", "sampler", "assignments", "accel")
@@ -118,12 +115,8 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     settings = settings_of(assignments, options)
     options |= checkpoint_options(output, options.pop("every"), options.pop("file"), options.pop("resume"))
     Scene().with_settings(**settings)
-    cluster, names = options.pop("cluster"), [name.strip() for name in options.pop("device").split(",")]
-    options |= {"device": names[0]} if len(names) == 1 else {"devices": names}
+    cluster = options.pop("cluster")
     if cluster is not None:
-        if len(names) > 1:
-            raise InputError("must be one device with --cluster, the device of each worker", argument="--device",
-                             hint="start a worker for each device")
         from wrt.renderer.workers import connected
 
         options["executor"] = click.get_current_context().with_resource(connected(cluster))

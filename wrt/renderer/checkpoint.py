@@ -26,7 +26,7 @@ from wrt.scene.settings import SETTINGS
 MAGIC = b"wrt checkpoint 2\n"
 # Options and settings that may change on resume; and `camera` and `device`, since the digest and the kind are compared instead.
 NO_PIXEL = ("spp", "exposure", "tonemap", "auto_exposure", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size",
-            "progress", "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
+            "progress", "checkpoint", "checkpoint_every", "resume", "camera", "device", "executor")
 HASHES = ("scene", "camera", "kernels")  # parts of the identity whose values tell a reader nothing
 
 

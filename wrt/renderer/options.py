@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, cast
 
@@ -96,8 +95,7 @@ class Options:
     checkpoint: str | os.PathLike[str] | None = None
     checkpoint_every: float = 60.0
     resume: bool = False
-    devices: Sequence[str] | None = None
-    executor: Executor | Client | None = None
+    executor: Client | None = None
 
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
@@ -127,23 +125,10 @@ class Options:
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")
         as_one(self.accel_options, dict, "accel_options")
         thread_count(self.threads)
-        self._check_devices()
-
-    def _check_devices(self) -> None:
-        if self.devices is not None and self.executor is not None:
-            raise InputError("and executor exclude each other", argument="devices", hint="each worker of an executor uses `device`")
-        if self.devices is not None:
-            self.devices = as_tuple(self.devices, str, "devices")
-            kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
-            if len(kinds) != 1:
-                raise InputError(f"must be one or more devices of one kind, since others round differently, got {shown(self.devices)}",
-                                 argument="devices")
-            self.device = self.devices[0]
-        elif self.executor is None:
+        if self.executor is None:
             start(self.device)
-        elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # an attribute of Dask's Client
-            raise InputError("must be a concurrent.futures.Executor or a dask.distributed.Client,"
-                             f" got {shown(self.executor)}", argument="executor")
+        elif not hasattr(self.executor, "get_executor"):  # an attribute of Dask's Client
+            raise InputError(f"must be a dask.distributed.Client, got {shown(self.executor)}", argument="executor")
 
 
 OPTIONS = tuple(each.name for each in fields(Options))
@@ -171,8 +156,7 @@ class RenderOptions(SettingChanges, total=False):
     checkpoint: str | os.PathLike[str] | None
     checkpoint_every: float
     resume: bool
-    devices: Sequence[str] | None
-    executor: Executor | Client | None
+    executor: Client | None
 
 
 # The options that decide on a pixel or on its computation, which `inspect` takes, and those of `profile`.

@@ -41,7 +41,7 @@ REFINED_FROM = 8  # smallest number of camera samples per triangle for which ref
 def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[RenderOptions]) -> Film:
     """Render a scene to a linear film.
 
-    The same arguments give the same pixels, bit for bit, for any `threads`, `tile_size`, `pass_size`, `devices` and `executor`.
+    The same arguments give the same pixels, bit for bit, for any `threads`, `tile_size`, `pass_size` and `executor`.
     Ctrl-C ends the render early: the film has the samples so far, and `stats["interrupted"]` is True.
 
     Parameters
@@ -93,9 +93,7 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
         Seconds of tracing between two writes of the checkpoint.
     resume : bool
         Continue from the checkpoint; must be True if the file exists. The picture has the bits of an uninterrupted render.
-    devices : sequence of str, optional
-        Several devices of one kind on this machine, which share the tiles. They replace `device`.
-    executor : concurrent.futures.Executor or dask.distributed.Client, optional
+    executor : dask.distributed.Client, optional
         Its workers trace the tiles, each on its `device`.
 
     Returns
@@ -123,7 +121,7 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     if resolved.target_error is not None and changes.get("spp") is None:
         changes["spp"] = MAX_SPP
     scene = as_scene(scene).with_settings(**changes)
-    if resolved.executor is None and resolved.devices is None:
+    if resolved.executor is None:
         film = Renderer(scene, resolved, once=True).run()
     else:
         from wrt.renderer.workers import render_with_workers
@@ -143,8 +141,8 @@ class Renderer:
     once: True if the caller needs one picture only. If this picture has few samples, wrt then chooses a faster builder (`builder_for`)."""
 
     def __init__(self, scene: Scene, options: Options, *, once: bool = False) -> None:
-        if options.executor is not None or options.devices is not None:
-            raise InputError("a Renderer runs on one device", hint="use wrt.render for `devices` or `executor`")
+        if options.executor is not None:
+            raise InputError("a Renderer runs on one device", hint="use wrt.render for an `executor`")
         device = start(options.device)
         plan = plan_of(scene, options)
         plan.require_memory(device)

@@ -317,7 +317,7 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
     metadata = {
         "scene": plain_text(plan.scene.name), "camera": plain_text(plan.camera.name), "spp": int(samples.max()), "seed": seed,
         "seconds": round(seconds["trace"], 3), "version": VERSION, "max_depth": settings.max_depth, "filter": settings.filter,
-        "accel": options.accel, "device": ",".join(options.devices or [options.device]),
+        "accel": options.accel, "device": options.device,
     }
     if settings.clamp:
         metadata |= {"clamp": settings.clamp, "clamped_share": stats["clamped_share"]}

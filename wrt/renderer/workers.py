@@ -1,4 +1,4 @@
-"""Renders that workers share: the devices of this machine, any executor, or a Dask cluster. The pixels have the bits of one device.
+"""Renders that the workers of a Dask cluster share. The pixels have the bits of one device.
 
 A tile is a pure function of the scene, the samples to trace and the tile's previous state (Prepared.trace_tile). Any worker can compute
 it, also again after another worker died. A worker process prepares a scene once, and keeps it under a key. This process keeps the film
@@ -15,15 +15,14 @@ import sys
 import threading
 import time
 import warnings
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -33,7 +32,6 @@ from wrt.core import VERSION
 from wrt.core.compiling import WATCH
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
-from wrt.core.threads import Pool
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import checkpoint_of
 from wrt.renderer.film import AovFilm, DeviceFilm, Rectangle, Work, tiles
@@ -50,12 +48,10 @@ if TYPE_CHECKING:
 CONNECT_SECONDS = 5.0  # time limit for reaching the scheduler
 WORKER_SECONDS = 10.0  # time limit for the first worker to connect
 QUEUED = 3  # Submitted jobs for each slot, so that no worker is idle.
-SLOTS = 32  # Assumed number of slots of an executor that does not state it.
 CACHED = 2  # Largest number of prepared scenes in a worker process.
 TILES_EACH = 4  # Tiles of a pass for each slot.
 SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: smaller tiles cost more to send, larger tiles take long
 OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")
-LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
 Job = tuple[Any, ...]  # The name of a method of Prepared, and its arguments.
 Reply = tuple[str, str, Any]  # The worker's name, the kind of its device (kind_of), and the result of the method.
@@ -137,14 +133,12 @@ _ready: OrderedDict[str, Prepared] = OrderedDict()
 _lock = threading.Lock()
 
 
-def call(key: str, package: Package | None, method: str, *arguments: object) -> Reply | None:
+def call(key: str, package: Package, method: str, *arguments: object) -> Reply:
     """Call a method of the prepared scene (Prepared) that this worker keeps under `key`, after preparing it from `package` if needed.
 
-    Returns None if the scene is missing and `package` is None. Raises InputError if the caller has a different installation."""
+    Raises InputError if the caller has a different installation."""
     with _lock:
         if key not in _ready:
-            if package is None:
-                return None
             check_installed(worker_name(), INSTALLED, package.installed)
             prepared = _prepared(pickle.loads(package.scene), Options(**package.options))
             if prepared.plan.kernels_hash() != package.kernels:
@@ -168,97 +162,59 @@ def worker_name() -> str:
     return f"{socket.gethostname()}:{os.getpid()}"
 
 
-class Devices:
-    """Several devices of this machine. Each has a thread of a pool, which prepares the scene and runs jobs."""
-
-    def __init__(self, scene: Scene, options: Options, names: tuple[str, ...]) -> None:
-        self.scene, self.options = scene, replace(options, **LOCAL)
-        self.free: SimpleQueue[tuple[str, str, Prepared | None]] = SimpleQueue()  # one entry for each thread
-        for i, name in enumerate(names):
-            self.free.put((f"{name} ({i})", name, None))
-        self.lock = threading.Lock()
-
-    def call(self, method: str, *arguments: Any) -> Reply:
-        label, name, prepared = self.free.get()
-        try:
-            if prepared is None:
-                with self.lock:  # the first device of a kind compiles the kernels for all devices of that kind
-                    prepared = _prepared(self.scene, replace(self.options, device=name))
-            return label, kind_of(prepared.device), getattr(prepared, method)(*arguments)
-        finally:
-            self.free.put((label, name, prepared))
-
-
 # --- in the process that renders --------------------------------------------------------------------------------------
 
 
 class Workers(NamedTuple):
-    """Workers of any kind.
+    """Workers of a cluster. submit: starts a job, and returns the Future of its Reply. slots: number of jobs that can run at once."""
 
-    - submit: starts a job, and returns the Future of its Reply. The reply is None if the worker lacks the scene, which then goes with
-      one more job for each such reply: if `send`, the job carries the scene.
-    - slots: number of jobs that can run at once. argument: the option that an error names."""
-
-    submit: Callable[[bool, Job], "Future[Reply | None]"]
+    submit: Callable[[Job], "Future[Reply]"]
     slots: int
-    argument: str
 
     def run(self, jobs: Iterable[Job]) -> Generator[tuple[Job, Reply] | None, None, None]:
         """Run jobs. Yield each job with its reply, in any order. While no reply comes, yield None every tenth of a second.
 
         A job is taken from `jobs` just before it is submitted. When the caller closes the generator, waiting jobs are cancelled."""
-        coming, again = iter(jobs), deque[Job]()
-        pending: dict[Future[Reply | None], Job] = {}
-        requests, done = 0, False
+        coming, done = iter(jobs), False
+        pending: dict[Future[Reply], Job] = {}
         try:
-            while pending or again or not done:
+            while pending or not done:
                 while len(pending) < QUEUED * self.slots:
-                    job = again.popleft() if again else next(coming, None)
+                    job = next(coming, None)
                     if job is None:
                         done = True
                         break
                     try:
-                        pending[self.submit(requests > 0, job)] = job
-                    except Exception as error:  # the executor or its connection is closed
-                        raise self.lost(error) from error
-                    requests = max(requests - 1, 0)
+                        pending[self.submit(job)] = job
+                    except Exception as error:  # the connection is closed
+                        raise lost(error) from error
                 finished = wait(pending, timeout=STEP_SECONDS, return_when=FIRST_COMPLETED).done
                 for future in finished:
-                    job, reply = pending.pop(future), future.result()
-                    if reply is None:
-                        again.append(job)
-                        requests += 1
-                    else:
-                        yield job, reply
+                    yield pending.pop(future), future.result()
                 if not finished:
                     yield None
-        except (BrokenExecutor, CancelledError, OSError) as error:
-            raise self.lost(error) from error
+        except (CancelledError, OSError) as error:
+            raise lost(error) from error
         finally:
             for future in pending:
                 future.cancel()
 
-    def lost(self, error: BaseException) -> InputError:
-        return InputError(f"its workers are lost: {error or type(error).__name__}", argument=self.argument)
+
+def lost(error: BaseException) -> InputError:
+    return InputError(f"its workers are lost: {error or type(error).__name__}", argument="executor")
 
 
 def workers_for(plan: Plan) -> Workers:
-    """Return the workers that the plan's options name."""
+    """Return the workers of the Client that the plan's options name, to which the scene is sent once."""
+    client: Any = plan.options.executor
+    check_workers(client)
     scene, options = replace(plan.scene, cameras=(plan.camera,)), replace(plan.options, camera=None, accel=plan.accel)
-    if options.devices is not None:
-        devices, pool = Devices(scene, options, tuple(options.devices)), Pool(len(options.devices))
-        return Workers(lambda send, job: pool.submit(devices.call, *job), len(options.devices), "devices")
     sent = {name: getattr(options, name) for name in OPTIONS_SENT}
     package = Package(INSTALLED, plan.kernels_hash(), sent, pickle.dumps(scene, pickle.HIGHEST_PROTOCOL))
     key = sha256(f"{package[:3]}{digest(scene)}{digest(plan.camera)}{scene.settings}".encode()).hexdigest()
-    executor: Any = options.executor
-    if hasattr(executor, "get_executor"):  # Dask's Client
-        check_workers(executor)
-        (there,) = executor.scatter([package], broadcast=True, hash=False)
-        slots, executor = max(1, sum(executor.nthreads().values())), executor.get_executor(pure=False)
-        return Workers(lambda send, job: executor.submit(call, key, there, *job), slots, "executor")
-    slots = int(getattr(executor, "_max_workers", None) or SLOTS)
-    return Workers(lambda send, job: executor.submit(call, key, package if send else None, *job), slots, "executor")
+    (there,) = client.scatter([package], broadcast=True, hash=False)
+    slots, executor = max(1, sum(client.nthreads().values())), client.get_executor(pure=False)
+    return Workers(lambda job: executor.submit(call, key, there, *job), slots)
 
 
 class WorkersTracer:
@@ -329,7 +285,7 @@ class WorkersTracer:
 
 
 def render_with_workers(scene: Scene, options: Options) -> Film:
-    """Render a scene for options with `devices` or `executor`."""
+    """Render a scene for options with an `executor`."""
     plan = plan_of(scene, options)
     plan.require_memory(start("cpu"))
     warn_left_out(scene)

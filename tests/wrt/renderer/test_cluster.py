@@ -139,21 +139,17 @@ def mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_commands(threads: Any, mesh: Path) -> None:
     address = threads.scheduler_address
-    for name, where in (("here", ()), ("there", ("--cluster", address)), ("devices", ("--device", "cpu,cpu"))):
+    for name, where in (("here", ()), ("there", ("--cluster", address))):
         done = run("render", mesh, "-o", f"{name}.exr", "--size", "64x36", "--spp", 4, "--json", "-q", *where)
         assert done.code == 0 and json.loads(done.out)["samples"] == 64 * 36 * 4, done.err
-    here = read_channels("here.exr")
-    for name in ("there", "devices"):
-        other = read_channels(f"{name}.exr")
-        assert here.keys() == other.keys() and all(np.array_equal(here[layer], other[layer]) for layer in here)
+    here, there = read_channels("here.exr"), read_channels("there.exr")
+    assert here.keys() == there.keys() and all(np.array_equal(here[layer], there[layer]) for layer in here)
     page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
     block = page.split("```python\n")[1].split("```")[0]
     assert block.count("tcp://scheduler:8786") == 1
     names: dict[str, Any] = {"wrt": wrt, "scene": SCENE}
     exec(block.replace("tcp://scheduler:8786", address).replace("spp=4096", "spp=2"), names)
     names["Client"].current().close()
-    done = run("render", mesh, "--cluster", address, "--device", "cpu,cpu")
-    assert done.code == 2 and len(done.errors) == 1 and "a worker for each device" in done.err
 
 
 def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:

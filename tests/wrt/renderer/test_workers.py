@@ -1,25 +1,23 @@
-"""Renders by threads, processes or several devices have the same bits as a render on one device."""
+"""Renders by workers have the same bits as a render on one device. The workers are threads of this process behind a Client's methods."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing.synchronize import Barrier
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.data import ROOT
-from tests.device import NAME
 from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt.io.load import load_scene
@@ -41,9 +39,31 @@ def whole() -> Film:
     return render(SCENE, aov=LAYERS)
 
 
+class Threads(ThreadPoolExecutor):
+    """What wrt calls of a dask.distributed.Client, with two threads as workers; test_cluster.py has real ones."""
+
+    asynchronous = False
+    scheduler = SimpleNamespace(address="here")
+    changes: Mapping[str, Any] = MappingProxyType({})  # of the package that is sent
+
+    def wait_for_workers(self, n: int, timeout: float) -> None: ...
+
+    def run(self, function: Any, *arguments: Any, on_error: str) -> dict[str, Any]:
+        return {"here": INSTALLED}
+
+    def scatter(self, packages: list[Any], broadcast: bool, hash: bool) -> list[Any]:
+        return [package._replace(**self.changes) for package in packages]
+
+    def nthreads(self) -> dict[str, int]:
+        return {"here": 2}
+
+    def get_executor(self, pure: bool) -> Threads:
+        return self
+
+
 @pytest.fixture
-def threads() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as pool:
+def threads() -> Iterator[Threads]:
+    with Threads(2) as pool:
         yield pool
 
 
@@ -53,71 +73,9 @@ def nothing_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_ready", type(workers._ready)())
 
 
-class Deaf(Executor):
-    """An executor that does not state its number of workers, and runs each job when it is submitted."""
-
-    def __init__(self) -> None:
-        self.packages = self.jobs = 0
-        self.forgets = False
-
-    def submit(self, function: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
-        self.packages += arguments[1] is not None
-        self.jobs += 1
-        if self.forgets and self.jobs % 7 == 3:  # as a restarted worker does
-            workers._ready.clear()
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-def test_several_devices(whole: Film) -> None:
-    film = render(SCENE, aov=LAYERS, devices=["cpu", "cpu"], **HOW)
-    assert same(film, whole)
-    assert set(film.stats["workers"]) == {"cpu (0)", "cpu (1)"} and film.metadata["device"] == "cpu,cpu"
-    assert film.stats["accel"]["nodes"] == whole.stats["accel"]["nodes"]
-    assert film.stats["seconds"].keys() == whole.stats["seconds"].keys()
-
-
 @pytest.mark.parametrize("options", [{"tile_size": 7, "pass_size": 5}, {"crop": (5, 3, 40, 30)}, {"target_error": 0.02}])
-def test_threads(options: dict[str, Any], threads: Executor) -> None:
+def test_threads(options: dict[str, Any], threads: Threads) -> None:
     assert same(render(SCENE, executor=threads, aov="depth", **options), render(SCENE, aov="depth", **options))
-
-
-def test_processes(whole: Film) -> None:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(2, context, initializer=die_late, initargs=(context.Barrier(2),)) as pool:
-        film = render(SCENE, aov=LAYERS, executor=pool, **HOW)
-        assert same(film, whole)
-        assert len(film.stats["workers"]) == 2 and f":{os.getpid()}" not in "".join(film.stats["workers"])
-        with refused("executor", "terminated abruptly"):
-            render(SCENE, executor=pool, spp=1 << 16, **HOW)
-
-
-def die_late(started: Barrier) -> None:
-    """Run in a worker process: the process works once all have started, and is killed at sample 64 of a tile."""
-    started.wait(60.0)
-    trace = Prepared.trace_tile
-
-    def deadly(self: Prepared, work: Any, *rest: Any) -> Any:
-        if work.first >= 64:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return trace(self, work, *rest)
-
-    Prepared.trace_tile = deadly  # type: ignore[method-assign]
-
-
-def test_an_executor_that_tells_nothing_gets_the_scene_once(whole: Film) -> None:
-    executor = Deaf()
-    assert same(render(SCENE, executor=executor, aov=LAYERS, **HOW), whole)
-    first = executor.packages
-    assert 1 <= first <= workers.QUEUED * workers.SLOTS  # calls that were submitted before a worker had the scene
-    render(SCENE, executor=executor, aov=LAYERS, **HOW)
-    assert executor.packages == first
-    executor.forgets = True
-    assert same(render(SCENE, executor=executor, aov=LAYERS, **HOW), whole) and executor.packages > first
 
 
 @pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
@@ -132,23 +90,21 @@ def test_shipped_scenes_can_be_sent(path: Path) -> None:
 # --- what belongs to a render ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("where", ["executor", "devices"])
-def test_an_interrupted_render_keeps_whole_tiles(where: str, threads: Executor) -> None:
+def test_an_interrupted_render_keeps_whole_tiles(threads: Threads) -> None:
     def stop(progress: Progress) -> None:
         if progress.done > 0:
             os.kill(os.getpid(), signal.SIGINT)
 
-    how: dict[str, Any] = {"executor": threads} if where == "executor" else {"devices": ["cpu", "cpu"]}
-    film = render(SCENE, spp=1 << 16, size=(200, 150), progress=stop, pass_size=4, **how, **HOW)
+    film = render(SCENE, spp=1 << 16, size=(200, 150), progress=stop, pass_size=4, executor=threads, **HOW)
     assert film.stats["interrupted"] and 0 < film.stats["samples"] < 200 * 150 << 16
     spp = int(film.samples.max())
     done = film.samples == spp
     assert np.array_equal(film.pixels[done], render(SCENE, spp=spp, size=(200, 150)).pixels[done])
 
 
-def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path, threads: Executor) -> None:
+def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path, threads: Threads) -> None:
     whole, path = render(SCENE, aov="depth"), tmp_path / "a.checkpoint"
-    for step, how in ((6, {}), (12, {"executor": threads}), (24, {"devices": [NAME, NAME]})):
+    for step, how in ((6, {}), (12, {"executor": threads}), (24, {})):
         film = render(SCENE, spp=step, aov="depth", checkpoint=path, resume=True, checkpoint_every=1e-9, **how, **HOW)
     assert same(film, whole) and film.stats["resumed"]["samples"] == 12
 
@@ -156,7 +112,7 @@ def test_a_checkpoint_from_threads_is_finished_by_others_and_back(tmp_path: Path
 # --- what goes wrong --------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
     trace, path = Prepared.trace_tile, tmp_path / "a.checkpoint"
 
     def fails(self: Prepared, work: Any, *rest: Any) -> Any:
@@ -173,16 +129,11 @@ def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads:
 
 
 @pytest.mark.parametrize("part", [*INSTALLED, "kernels"])
-def test_a_worker_of_another_installation_is_refused(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Other(Deaf):
-        def submit(self, function: Any, key: str, package: Any, *arguments: Any, **_: Any) -> Future[Any]:  # type: ignore[override]
-            if package is not None:
-                change = {"kernels": "0" * 64} if part == "kernels" else {"installed": {**INSTALLED, part: "0"}}
-                package = package._replace(**change)
-            return super().submit(function, key, package, *arguments)
-
+def test_a_worker_of_another_installation_is_refused(part: str, threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
+    change = {"kernels": "0" * 64} if part == "kernels" else {"installed": {**INSTALLED, part: "0"}}
+    monkeypatch.setattr(threads, "changes", change)
     with refused(what="other kernels" if part == "kernels" else f"{part} {INSTALLED[part]} (here 0)"):
-        render(SCENE, executor=Other())
+        render(SCENE, executor=threads)
 
 
 def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
@@ -202,17 +153,14 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     assert digest_there() != INSTALLED["code of wrt"]
 
 
-def test_workers_on_devices_of_several_kinds_are_refused(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_on_devices_of_several_kinds_are_refused(threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     monkeypatch.setattr(workers, "kind_of", lambda device: asked.append("") or f"cuda, sm_{80 + (len(asked) > 1)}")
     with refused(what="several kinds"):
         render(SCENE, executor=threads, **HOW)
 
 
-@pytest.mark.parametrize(("options", "argument"), [
-    ({"devices": []}, "devices"), ({"devices": ["cpu", "gpu"]}, "device"), ({"devices": [1]}, "devices[0]"),
-    ({"executor": "tcp://127.0.0.1:1"}, "executor"), ({"executor": 3}, "executor"), ({"executor": Deaf(), "devices": ["cpu"]}, "devices"),
-])
-def test_bad_options(options: dict[str, Any], argument: str) -> None:
-    with refused(argument):
-        Options(**options)
+@pytest.mark.parametrize("executor", ["tcp://127.0.0.1:1", 3, ThreadPoolExecutor(1)])
+def test_what_is_no_client_is_refused(executor: object) -> None:
+    with refused("executor", "dask.distributed.Client"):
+        Options(executor=executor)  # type: ignore[arg-type]
