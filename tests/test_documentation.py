@@ -207,7 +207,7 @@ def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytes
     assert blocks
     for i, block in enumerate(blocks):
         cheap = re.sub(r"spp=\d+", "spp=2", block).replace("640x360", "24x14").replace("(640, 360)", "(24, 14)")
-        cheap = cheap.replace('"bunny.ply"', '"model.ply"').replace(", progress=wrt.LiveView()", ", spp=1, size=(24, 14)")
+        cheap = cheap.replace('"bunny.ply"', '"model.ply"').replace("progress=lambda", "spp=1, size=(24, 14), progress=lambda")
         file = tmp_path / f"block_{i}.py"  # Warp reads the source of kernels
         file.write_text(cheap, encoding="utf-8")
         exec(compile(cheap, file, "exec"), names)

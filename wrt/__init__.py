@@ -3,7 +3,7 @@
 Ray queries without a picture: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, accel_from_tree, camera_rays; all_hits,
 count_hits, first_hits, contains, winding_number, visible; closest_points, signed_distance.
 Ray queries from your own Warp kernels: kernel, ray_query. Gradients: Hits.gradients, and the modules torch, jax.
-Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
+Pictures: load_scene, render, Film, Options, Progress, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
@@ -75,7 +75,6 @@ if TYPE_CHECKING:
     from wrt.scene.model import Sphere as Sphere
     from wrt.scene.motion import Motion as Motion
     from wrt.scene.settings import Settings as Settings
-    from wrt.viewer.notebook import LiveView as LiveView
     from wrt.viewer.notebook import side_by_side as side_by_side
 
 

@@ -28,7 +28,7 @@ API = {  # title: objects, of wrt unless the module is named
     "Your own kernels": "kernel ray_query",
     "Gradients": "torch jax",
     "Sensors": "sensors",
-    "Pictures": "load_scene render Film Options Progress LiveView side_by_side wrt.picture.metrics",
+    "Pictures": "load_scene render Film Options Progress side_by_side wrt.picture.metrics",
     "Scenes": "Scene Settings Object Sphere Motion Camera OrthographicCamera FisheyeCamera PanoramaCamera wrt.scene.shapes",
     "Materials and lights": "Material Texture Checkerboard PointLight DirectionalLight SpotLight ConstantBackground GradientBackground "
                             "EnvironmentBackground",

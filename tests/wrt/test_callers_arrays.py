@@ -284,7 +284,7 @@ CALLS: dict[str, Call] = {
 }
 
 NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kernel", "load_mesh", "load_scene", "ray_query", "Progress",
-             "LiveView", "inspect", "profile", "camera_rays", "sensors.LIDARS", "Accelerator.save", "OneMesh.save",
+             "inspect", "profile", "camera_rays", "sensors.LIDARS", "Accelerator.save", "OneMesh.save",
              "OneMesh.tree", "OneMesh.options", "Mesh.save", "Mesh.note_clean", "Mesh.to_trimesh",
              "Scene.save", "Scene.bounds", "Scene.camera", "Scene.outlines", "Scene.with_settings", "Camera.lens", "Camera.opened",
              "Camera.record", "Camera.switches", "Mesh.reach", "Mesh.warn_if_far", "OneMesh.restore", "Instances.restore"}

@@ -107,7 +107,6 @@ METHODS: dict[str, Call] = {
     "Hits.uv": lambda s: s.hits.uv,
     "Hits.gradients": lambda s: s.hits_of_mesh.gradients(t=s.ranges),
     "Hits.numpy": lambda s: s.hits.numpy(),
-    "Hits.save": lambda s: s.hits.save(s.folder / "hits.csv"),
     "Sensor.depth": lambda s: s.sensor.depth(s.seen),
     "Sensor.range": lambda s: s.sensor.range(s.seen),
     "Sensor.points": lambda s: s.sensor.points(s.seen),
@@ -138,7 +137,7 @@ OTHERS: dict[str, Call] = {  # more forms of the same calls
 CALLS = FUNCTIONS | METHODS | OTHERS
 # Public names whose work is done in NumPy alone, or that own kernels need.
 AT_ONCE = {*"""
-    __version__ ray_query kernel ACCELERATORS InputError SceneWarning load_scene load_mesh Film Options Progress Settings LiveView
+    __version__ ray_query kernel ACCELERATORS InputError SceneWarning load_scene load_mesh Film Options Progress Settings
     side_by_side ConstantBackground EnvironmentBackground GradientBackground Camera FisheyeCamera OrthographicCamera PanoramaCamera
     DirectionalLight PointLight SpotLight Checkerboard Material Texture Mesh Object Scene Sphere Motion""".split()}
 AT_ONCE |= {f"{kind}.{name}" for kind, names in {

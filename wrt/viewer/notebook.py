@@ -1,79 +1,18 @@
-"""Pictures in a notebook: a running render, and several pictures side by side."""
+"""Pictures side by side, as a notebook shows them."""
 
 from __future__ import annotations
 
-import base64
-import html
-import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.core.compiling import COMPILING
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.picture.film import Film
-from wrt.renderer.options import Progress
-from wrt.renderer.progress import describe
 
 if TYPE_CHECKING:
-    from IPython.display import DisplayHandle
     from PIL import Image
-
-SHARE = 0.1  # largest share of the time that may go into showing pictures
-
-
-class LiveView:
-    """A callback that shows a render's picture and progress in the output of a notebook's cell.
-
-    Interrupting the notebook's kernel ends the render, which then returns a Film with the samples so far.
-
-    Parameters
-    ----------
-    every
-        Seconds between two pictures. The pause is longer if showing pictures would take over a tenth of the time.
-
-    Raises
-    ------
-    InputError
-        If IPython is not installed.
-
-    Examples
-    --------
-    >>> film = wrt.render(scene, progress=wrt.LiveView())
-    """
-
-    def __init__(self, every: float = 0.5) -> None:
-        try:
-            from IPython.display import HTML, display
-        except ImportError:
-            raise InputError("LiveView shows pictures in a notebook: IPython is not installed") from None
-        self._html, self._display = HTML, display
-        self.every = every
-        self._due = 0.0
-        self._handle: DisplayHandle | None = None
-
-    def __call__(self, progress: Progress) -> None:
-        begin = time.monotonic()
-        done = progress.picture is not None and progress.done == progress.total
-        if begin < self._due and not done:
-            return
-        if progress.stage == "compile":
-            text = COMPILING
-        else:
-            text = f"{progress.done / max(progress.total, 1):.0%} {'' if progress.picture else progress.stage} {describe(progress)}"
-        page = f"<pre>{html.escape(text)}</pre>"
-        if progress.picture is not None:
-            picture = base64.b64encode(progress.picture()._repr_png_()).decode()
-            page = f'<img src="data:image/png;base64,{picture}" alt="the picture so far">' + page
-        if self._handle is None:
-            self._handle = self._display(self._html(page), display_id=True)
-        else:
-            self._handle.update(self._html(page))
-        now = time.monotonic()
-        self._due = now + max(self.every, (now - begin) / SHARE)
-
 
 TITLE, GAP = 22, 8  # pixels: height of a title above a picture, and space between pictures
 

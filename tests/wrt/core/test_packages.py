@@ -97,9 +97,9 @@ for call in {list(REFUSED)}:
 def test_the_command_line_says_so_too(folder: Path) -> None:
     done = run("-c", LEAN + "import runpy; runpy.run_module('wrt', run_name='__main__')", folder=folder)
     assert (done.returncode, done.stderr) == (2, "error: the command line needs click; pip install click\n")
-    without = "import sys; sys.modules['trimesh'] = None\nimport wrt.__main__ as script; sys.argv[1:] = sys.argv[2:]; script.main()"
-    done = run("-c", without, "-", "bench", "closed", "--quick", folder=folder)
-    assert (done.returncode, done.stderr.splitlines()[-1]) == (2, "error: this command needs trimesh; pip install trimesh")
+    without = "import sys; sys.modules['warp'] = None\nimport wrt.__main__ as script; sys.argv[1:] = sys.argv[2:]; script.main()"
+    done = run("-c", without, "-", "devices", folder=folder)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (2, "error: this command needs warp; pip install warp")
 
 
 def test_other_errors_of_an_import_stay_what_they_are() -> None:

@@ -1,86 +1,17 @@
-"""Output in notebooks: a picture that is updated during the render, pictures side by side, and tables."""
+"""Output in notebooks: pictures side by side, and tables."""
 
 from __future__ import annotations
 
-import base64
-import io
-import re
-import signal
-import sys
-import types
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import wrt
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
 from wrt.core.tables import html_table
-from wrt.renderer.options import Progress
-from wrt.viewer.notebook import LiveView
-
-# --- the picture so far -----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, str]]]:
-    """Record the displayed pages, each with "new" or "update". The fixture replaces IPython, whether installed or not."""
-    pages: list[tuple[str, str]] = []
-
-    class Handle:
-        def update(self, page: Any) -> None:
-            pages.append(("update", page))
-
-    def display(page: Any, *, display_id: bool) -> Handle:
-        assert display_id
-        pages.append(("new", page))
-        return Handle()
-
-    module = types.ModuleType("IPython.display")
-    module.HTML, module.display = str, display  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
-    monkeypatch.setitem(sys.modules, "IPython.display", module)
-    yield pages
-
-
-def picture_of(page: str) -> np.ndarray:
-    data = re.search(r'src="data:image/png;base64,([^"]+)"', page)
-    assert data is not None, page[:200]
-    with Image.open(io.BytesIO(base64.b64decode(data[1]))) as image:
-        return np.asarray(image)
-
-
-def test_a_render_is_shown_in_place_and_finished_in_the_end(shown: list[tuple[str, str]]) -> None:
-    film = wrt.render(SCENE, spp=8, progress=LiveView(every=0.0))
-    assert [how for how, _ in shown] == ["new"] + ["update"] * (len(shown) - 1) and len(shown) >= 1
-    assert np.array_equal(picture_of(shown[-1][1]), film.to_srgb8()) and "100%" in shown[-1][1]
-
-
-def test_an_interrupt_keeps_the_picture_so_far(shown: list[tuple[str, str]]) -> None:
-    view = LiveView(every=0.0)
-
-    def progress(p: Progress) -> None:
-        view(p)
-        if p.done > 0:
-            signal.raise_signal(signal.SIGINT)  # a notebook's stop button sends SIGINT
-
-    film = wrt.render(SCENE, spp=1 << 20, progress=progress)
-    assert film.stats["interrupted"] and 0 < film.samples.max() < 1 << 20
-    assert picture_of(shown[-1][1]).shape == (34, 61, 3) and film._repr_png_().startswith(b"\x89PNG")
-
-
-def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.viewer.notebook.SHARE", 1e9)
-    view = LiveView(every=0.0)
-    view(Progress(0, 10, 0, 0.0, stage="compile"))
-    view(Progress(3, 10, 0, 1.0, stage="build"))
-    view(Progress(1, 10, 5, 1.0, note="<b>the disk is full</b>"))
-    assert all("<img" not in page for _, page in shown) and "compiling" in shown[0][1] and "30% build" in shown[1][1]
-    assert "&lt;b&gt;the disk is full" in shown[2][1]
 
 
 def test_pictures_side_by_side_keep_their_pixels() -> None:

@@ -17,8 +17,8 @@ from wrt.core.arrays import check_no_gradients, from_tensor, given_like, is_tens
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
-from wrt.core.tables import html_table, write_table
-from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
+from wrt.core.tables import html_table
+from wrt.core.types import Array, ArrayT, Device, TensorT, WarpArray
 
 HIT_TYPES = {f"out.{name}": np.dtype(np.int32 if name == "prim_id" else np.float32) for name in ("t", "u", "v", "prim_id")}
 ANY_HIT_TYPES = {"out": np.dtype(np.bool_)}
@@ -115,20 +115,6 @@ class Hits(HitPoints[ArrayT]):
         if len(t):
             facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
         return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
-
-    def save(self, path: PathLike) -> None:
-        """Write a table, one row per element of `t` in C order, to `path`, a .csv or .parquet file.
-
-        Its columns are index, t, u, v, prim_id; x, y and z of `point`, if the hits have a `source`; and `counters`, if any.
-        Numbers keep their bits. On a miss, t is inf, prim_id -1, and x, y and z are NaN.
-        """
-        hits = self.numpy()
-        columns = {"index": np.arange(hits.t.size), "t": hits.t, "u": hits.u, "v": hits.v, "prim_id": hits.prim_id}
-        if hits.source is not None and hits.source[1] is not None:
-            columns |= dict(zip("xyz", np.moveaxis(hits.point, -1, 0), strict=True))
-        if hits.counters is not None:
-            columns |= {name: hits.counters.counts[name] for name in hits.counters.counts.dtype.names or ()}
-        write_table(path, {name: column.reshape(-1) for name, column in columns.items()})
 
     def numpy(self) -> Hits[npt.NDArray[Any]]:
         """Return the hits with NumPy arrays, which share the memory of hits on the CPU."""

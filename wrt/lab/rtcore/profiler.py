@@ -18,7 +18,7 @@ from wrt.accel.snapshot import WrappedStructure
 from wrt.core.device import memory_of, on_host, start, upload
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
-from wrt.core.tables import html_table, write_table
+from wrt.core.tables import html_table
 from wrt.core.threads import run_all
 from wrt.core.types import PathLike
 from wrt.io.load import as_scene
@@ -134,20 +134,6 @@ class Profile:
                     sums |= {"stack": int(counts["stack"].max()), "lines": int(rays.lines[chosen].sum(dtype=np.int64))}
                     rows.append({"depth": int(depth), "kind": kind, "hits": int(rays.rays["hit"][chosen].sum()), **sums})
         return rows
-
-
-    def save(self, path: PathLike) -> None:
-        """Write a table with one row per ray, in the order of `rays`, to a .csv or .parquet file.
-
-        Its columns are x and y of the pixel, kind, depth, origin (ox, oy, oz), direction (dx, dy, dz), t_min, t_max, hit (0 or 1), the
-        counters, and lines. Raises InputError for another suffix, without pyarrow (Parquet), or if writing fails.
-        """
-        rays, logged = self.rays, self.rays.rays
-        y, x = np.divmod(rays.pixel, self.size[0])
-        columns = {"x": x, "y": y, "kind": np.array(KINDS)[rays.kind], "depth": rays.depth}
-        columns |= {f"{name[0]}{axis}": logged[name][:, i] for name in ("origin", "direction") for i, axis in enumerate("xyz")}
-        columns |= {name: logged[name] for name in ("t_min", "t_max", "hit")}
-        write_table(path, columns | {name: rays.counts[name] for name in COUNTERS} | {"lines": rays.lines})
 
 
 def profile(scene: Scene | Mesh | PathLike, **options: Unpack[RenderOptions]) -> Profile:

@@ -18,7 +18,6 @@ from wrt.accel.queries.rays import Rays
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
 from wrt.core.files import require_file, write_bytes
-from wrt.core.tables import TABLES, write_table
 from wrt.core.types import ArrayLike, PathLike
 from wrt.kernels.traverse import steps as of
 from wrt.kernels.traverse.observer import PRIMITIVE_SPACE
@@ -145,17 +144,9 @@ class Trace:
         return replace(self, first=before[self.first], child_first=child_before[self.child_first[np.append(rows, True)]], **arrays)
 
     def save(self, path: PathLike) -> None:
-        """Write the trace to a .npz file, which `load` and np.load read, or its fetches to a .csv or .parquet file.
-
-        A table has one row per fetch: ray (the index), address, size, depth, test (a name in `TESTS`), tests, result. It leaves out
-        rays, children and prefetches. Raises InputError for another suffix, without pyarrow (Parquet), or if writing fails.
-        """
-        suffix = as_path(path, "path").suffix.lower()
-        if suffix in TABLES:
-            columns = {name: getattr(self, name) for name in ("ray", *PER_FETCH)}
-            return write_table(path, {**columns, "test": np.array(TESTS)[self.test]})
-        if suffix != ".npz":
-            raise InputError(f"the file of a trace must have the suffix .npz, {' or '.join(TABLES)}", path=path)
+        """Write the trace to a .npz file, which `load` and np.load read. Raises InputError for another suffix, or if writing fails."""
+        if as_path(path, "path").suffix.lower() != ".npz":
+            raise InputError("the file of a trace must have the suffix .npz", path=path)
         data = io.BytesIO()
         arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
         np.savez_compressed(data, allow_pickle=False, **arrays)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.refused import refused
 from tests.rewalk import REWALK, rays
 from wrt.lab.rtcore.profiler import COUNTERS, KINDS, PICTURES, Profile, profile
 from wrt.renderer.options import Progress
@@ -127,19 +126,3 @@ def test_a_scene_has_its_own_samples_a_mesh_one_and_progress_ends_at_all_samples
     assert [profile(path, size=8).spp for path in (tmp_path / "mirrors.toml", tmp_path / "box.obj", box())] == [3, 1, 1]
     assert [each.done for each in told] == sorted({each.done for each in told}) and len(told) > 2
     assert told[-1].done == told[-1].total == 3 * found.spp * found.size[0] * found.size[1] and told[-1].rays == 3 * len(found.rays)
-
-
-def test_a_profile_is_written_as_a_table_of_its_rays(scene: Scene, tmp_path: Path) -> None:
-    """Its rows have the numbers of `rays`, and sums over pixels are the maps."""
-    found = profile(scene, spp=1)
-    found.save(tmp_path / "rays.csv")
-    head, *lines = (tmp_path / "rays.csv").read_text().splitlines()
-    table = dict(zip(head.split(","), zip(*(line.split(",") for line in lines), strict=True), strict=True))
-    assert len(lines) == len(found.rays) and list(table["kind"]) == [KINDS[kind] for kind in found.rays.kind]
-    for name, expected in (("dy", found.rays.rays["direction"][:, 1]), ("t_max", found.rays.rays["t_max"]), ("depth", found.rays.depth)):
-        assert np.array_equal(np.array(table[name], expected.dtype), expected)
-    nodes = np.zeros_like(found.maps["nodes"])
-    np.add.at(nodes, (np.int64(table["y"]), np.int64(table["x"])), np.float64(table["nodes"]))
-    assert np.array_equal(nodes, found.maps["nodes"])
-    with refused(what="suffix .csv"):
-        found.save(tmp_path / "rays.npy")
