@@ -1,6 +1,5 @@
 """Compute the boxes and records of triangles and spheres on any device, so that a moving mesh need not leave the GPU.
-The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.geometry.corners). `write_rows`
-is for CPUs.
+The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.geometry.corners).
 A launch of size dim processes the primitives or records first .. first + dim - 1."""
 
 from typing import TYPE_CHECKING
@@ -175,8 +174,12 @@ def store_lane(rows: wp.array(dtype=wp.float32), row: int, lane: int, width: int
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
     float* to = out.data + (long long)row * 10 * width;
     return width == 8 ? wrt::store_triangles<8>(shape, order, begin, count, to) : wrt::store_triangles<4>(shape, order, begin, count, to);
+#endif
 """)
 def store_triangles(shape: Shape, order: wp.array(dtype=wp.int32), begin: int, count: int, out: wp.array(dtype=wp.float32), row: int,
                     width: int) -> bool: ...

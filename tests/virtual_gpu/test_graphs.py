@@ -72,15 +72,22 @@ def test_a_launch_of_a_graph_after_its_arrays_are_freed_is_an_error() -> None:
         wp.capture_launch(capture.graph)
 
 
-def moving() -> tuple[Accelerator, wp.array, list[wp.array], Hits]:
-    accel = wrt.build(BALL, "bvh2", device="cuda:0")
+def moving(name: str = "bvh2") -> tuple[Accelerator, wp.array, list[wp.array], Hits]:
+    accel = wrt.build(BALL, name, device="cuda:0")
     rays = [wp.array(array, dtype=wp.vec3, device="cuda:0") for array in np.random.default_rng(1).normal(size=(2, 500, 3))]
     return accel, wp.array(BALL.vertices, dtype=wp.vec3, device="cuda:0"), rays, accel.closest_hit(*rays)
 
 
-def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
-    accel, points, rays, out = moving()
+@pytest.mark.parametrize("name", ["bvh2", "bvh8", "bvh8c"])
+def test_a_refit_and_a_query_are_captured_and_follow_the_points(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    accel, points, rays, out = moving(name)
     accel.refit(points, in_place=True)
+    copies, waits = gpus().counts.copies.copy(), gpus().counts.synchronisations
+    allocated: list[int] = []
+    monkeypatch.setattr(gpus().memory, "allocate", lambda *sizes: allocated.extend(sizes))
+    accel.refit(points, in_place=True)
+    assert gpus().counts.copies - copies == {"d2d": 1} and not allocated and gpus().counts.synchronisations == waits
+    monkeypatch.undo()
     copies = gpus().counts.copies.copy()
     with wp.ScopedCapture("cuda:0") as capture:
         accel.refit(points, in_place=True)
@@ -92,7 +99,7 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points() -> None:
         wp.capture_launch(capture.graph)
         assert gpus().counts.launches.total() == launches + 4  # boxes, tree, corners, rays
         assert gpus().counts.copies - copies == {"d2d": 1}
-        expected = wrt.build(wrt.Mesh(np.float32(scale) * BALL.vertices, BALL.faces), "bvh2", device="cpu").closest_hit(
+        expected = wrt.build(wrt.Mesh(np.float32(scale) * BALL.vertices, BALL.faces), name, device="cpu").closest_hit(
             rays[0].numpy(), rays[1].numpy(), t_max=5.0)
         for name in FIELDS:
             assert getattr(out, name).numpy().tobytes() == getattr(expected, name).tobytes()

@@ -121,7 +121,7 @@ class OneMesh(Accelerator, ABC):
         return moved_to(self.geometry, vertices)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
-        raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh2")
+        raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh8, bvh4 or bvh2")
 
     def refit(self, vertices: ArrayLike, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Fit the boxes of the tree to moved vertices. The topology of the tree does not change.
@@ -137,8 +137,9 @@ class OneMesh(Accelerator, ABC):
         rebuild_at : float
             Build a new tree if the SAH cost exceeds this multiple of its value at the last build.
         in_place : bool
-            Only bvh2: write to the existing arrays, so that a CUDA graph can capture the refit. `vertices` must be a Warp array on the
-            structure's device. After the first call, nothing is allocated. No other thread may query at the same time.
+            Only bvh2, bvh4, bvh8 and bvh8c: kernels write to the existing arrays, so that a graph can capture the refit. `vertices` must be
+            a Warp array on the structure's device. After the first call, nothing is allocated or copied to the host. No other thread may
+            query at the same time.
 
         Returns
         -------
@@ -152,7 +153,8 @@ class OneMesh(Accelerator, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
-        refuse_capture(None if in_place else self.device)
+        if not in_place:
+            refuse_capture(self.device)
         rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:

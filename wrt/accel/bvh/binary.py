@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -13,29 +12,20 @@ import warp as wp
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, BoxTree
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, binary_tree_of, build_binary, sah_cost
+from wrt.accel.bvh.in_place import InPlaceBvh
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry, NumberedGeometry
-from wrt.accel.queries.rays import vectors
 from wrt.accel.snapshot import Built
-from wrt.accel.store import check_binary, save
+from wrt.accel.store import check_binary
 from wrt.core.device import launch_on, upload
-from wrt.core.errors import InputError
-from wrt.core.types import ArrayLike, PathLike, WarpArray, WarpStruct
+from wrt.core.types import ArrayLike, WarpArray, WarpStruct
 from wrt.kernels.build.shape import write_corners
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import bvh2 as kernels
 
 RECORDS_PER_JOB = 32768
-
-
-class InPlace(NamedTuple):
-    """Arrays for refits in place. tree: kernels.build.fit.Tree; shape: kernels.build.shape.Shape, which receives the new points."""
-
-    fitting: Fitting
-    tree: WarpStruct
-    shape: WarpStruct
 
 
 class BinaryBvh(OneMesh):
@@ -76,7 +66,7 @@ def box_tree(nodes: np.ndarray, order: np.ndarray) -> BoxTree:
     return BoxTree(lo, hi, first.astype(np.int32), np.where(lo[..., 0] > hi[..., 0], ABSENT, count).astype(np.int32), order)
 
 
-class Bvh2(BinaryBvh):
+class Bvh2(InPlaceBvh, BinaryBvh):
     __doc__ = BinaryBvh.__doc__
 
     name = "bvh2"
@@ -90,12 +80,6 @@ class Bvh2(BinaryBvh):
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
-
-    def _shape(self) -> WarpStruct:
-        """Upload the geometry. Its faces are cached on the device."""
-        shape = self.geometry.on(self.device, self._cache.get("faces"))
-        self._cache["faces"] = shape.faces
-        return shape
 
     def _on_device(self, built: Built) -> Built:
         """Return `built` with its arrays copied to the device, and with the parents of the nodes."""
@@ -111,14 +95,6 @@ class Bvh2(BinaryBvh):
         points = wp.clone(self._points(vertices), device=self.device)
         return DeviceGeometry.unchecked(points, self._shape().faces, self.geometry.spheres)
 
-    def _points(self, vertices: ArrayLike) -> WarpArray:
-        points = DeviceGeometry.checked_points(vertices, "vertices")
-        if len(points) != self.geometry.n_vertices:
-            raise InputError(f"must be ({self.geometry.n_vertices},), got ({len(points)},)", argument="vertices")
-        if points.device.is_cpu:
-            vectors(points.numpy(), "vertices")
-        return points
-
     def _refit(self, built: Built) -> Built:
         """Refit on the device. Only the summary of the root, with the SAH cost, is copied to the host."""
         built = self._on_device(built)
@@ -127,38 +103,22 @@ class Bvh2(BinaryBvh):
         fitting.refit(tree_of(fitting, nodes, built.parents, built.order), self._shape(), self.threads)
         return replace(built, arrays={"nodes": nodes}, sah_cost=fitting.root().sah_cost)
 
-    def _refit_in_place(self, points: ArrayLike) -> None:
-        points = self._points(points)
-        if points.device != self.device or self.structure.units.triangle_test.layout != "corners":
-            raise InputError(f"a refit in place needs a Warp array on {self.device}, and the watertight triangle test",
-                             argument="vertices")
-        cached: InPlace | None = self._cache.get("in place")
-        if cached is None or cached.tree.nodes is not self.data.nodes:
-            if self.device.is_capturing:
-                raise InputError("a graph cannot capture the first refit in place, which allocates memory",
-                                 hint="refit in place once before the capture")
-            cached = self._cache["in place"] = self._begin_in_place(points)
-        wp.copy(cached.shape.vertices, points)
-        cached.fitting.refit(cached.tree, cached.shape, self.threads)
-        self._write_corners(cached.shape, cached.tree.order, self.data.primitives)
+    def _copied(self, built: Built) -> Built:
+        built = self._on_device(built)
+        return replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])})
 
-    def save(self, path: PathLike, mesh: bool = False) -> None:
-        """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""
-        snapshot = self.snapshot
-        built = snapshot.arrays
-        if math.isnan(built.sah_cost):
-            snapshot = replace(snapshot, built=replace(built, sah_cost=sah_cost(built.on_host().arrays["nodes"])))
-        save(snapshot, path, mesh)
+    def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
+        fitting, data = Fitting(self.device, len(self.geometry), built.nodes), self.data
+        tree = tree_of(fitting, data.nodes, built.parents, built.order)
 
-    def _begin_in_place(self, points: WarpArray) -> InPlace:
-        """Give the structure arrays that no snapshot shares; return the arrays that refits in place need."""
-        built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
-        built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
-        moved = DeviceGeometry.unchecked(wp.clone(points), self._shape().faces, spheres)
-        beside = self._over(moved, built, self._snapshot.built_cost)
-        fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
-        self._snapshot = replace(beside.snapshot, changes=True)
-        return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
+        def run() -> None:
+            fitting.refit(tree, shape, self.threads)
+            self._write_corners(shape, tree.order, data.primitives)
+
+        return run
+
+    def _cost(self, built: Built) -> float:
+        return sah_cost(built.arrays["nodes"])
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
         """Return the triangle test's records.
@@ -173,4 +133,5 @@ class Bvh2(BinaryBvh):
         return out
 
     def _write_corners(self, shape: WarpStruct, order: WarpArray, out: WarpArray) -> None:
-        launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
+        launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB,
+                  captured=True)

@@ -33,14 +33,15 @@ class Fitting:
 
     def find_bounds(self, shape: WarpStruct, threads: int = 1) -> None:
         """Compute the box of each primitive of a kernels.build.shape.Shape."""
-        launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
+        launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads,
+                  step=PRIMITIVES_PER_JOB, captured=True)
 
     def fit(self, tree: WarpStruct, options: WarpStruct | None = None) -> None:
         """Fit the tree's boxes to the primitives' boxes. options: BuildOptions, to make leaves of subtrees where that costs no more."""
         if options is None:
             options = BuildOptions()
             options.row = 1
-        launch_on(self.device, kernels.fit, self.nodes, tree, options)
+        launch_on(self.device, kernels.fit, self.nodes, tree, options, captured=True)
 
     def refit(self, tree: WarpStruct, shape: WarpStruct, threads: int = 1) -> None:
         """Fit the tree's boxes to the whole primitives of `shape`, even if spatial splits clipped them. A CUDA graph can capture this."""

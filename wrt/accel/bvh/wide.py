@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import ABSENT, INNER, BoxTree
 from wrt.accel.bvh.builders import BinaryOptions, BinaryTree, BvhOptions, binary_tree_of, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
+from wrt.accel.bvh.in_place import InPlaceBvh
+from wrt.accel.bvh.refit import Fitting
 from wrt.accel.bvh.top_down import build_few
 from wrt.accel.bvh.wide_tree import (
     WideTree,
@@ -31,7 +34,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_launches import launch_raw
 from wrt.accel.snapshot import Built
 from wrt.core.building import report, report_parts
-from wrt.core.device import aligned, empty_aligned, preloading, record_dtype, start
+from wrt.core.device import aligned, empty_aligned, launch_on, preloading, record_dtype, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
@@ -41,6 +44,7 @@ from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
+SLOTS_PER_JOB = 1 << 16
 SMALL = 128  # primitives: so few trees are built in one launch, and without reinsertion, which gains nothing there
 BINARY = 0.8  # share of a build's time after which the binary tree is finished, for large meshes
 ROWS_BY_KERNEL = 1 << 15  # triangles
@@ -130,11 +134,13 @@ class CollapsedBvh(OneMesh):
         return replace(built, sah_cost=self._tree(built).sah_cost(wide.root_area))
 
     def _refit(self, built: Built) -> Built:
+        built = built.on_host()
         tree = refit(self._tree(built), self.geometry)
         built = replace(built, arrays=self._arrays(tree))
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
-class WideBvh(CollapsedBvh):
+
+class WideBvh(InPlaceBvh, CollapsedBvh):
     """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""
 
     def _build(self, options: BinaryOptions) -> Built:
@@ -186,11 +192,17 @@ class WideBvh(CollapsedBvh):
         children = packed(self._references(built), self.width)
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth)
 
+    def _starts(self, built: Built) -> np.ndarray:
+        """Return the index in the order of each row's first primitive and, last, the number of primitives, (rows + 1,) int32."""
+        count, width = len(built.order), self.width
+        if self.compressed:
+            return np.minimum(np.arange(0, count + width, width, dtype=np.int32), count)
+        return row_starts(self._references(built), width)
+
     def _primitives(self, built: Built) -> np.ndarray:
         """Return the records of the triangle test in rows of `width` lanes; an unused lane repeats the primitive before it."""
-        units, width, order = self.structure.units, self.width, built.order
-        starts = (np.minimum(np.arange(0, len(order) + width, width, dtype=np.int32), len(order)) if self.compressed
-                  else row_starts(self._references(built), width))
+        built = built.on_host()
+        units, width, order, starts = self.structure.units, self.width, built.order, self._starts(built)
         floats = record_dtype(units.triangle_test.record).itemsize // 4
         rows = empty_aligned((len(starts) - 1, floats, width), np.float32)
         if self._rows_by_kernel():
@@ -213,7 +225,47 @@ class WideBvh(CollapsedBvh):
                 and self.geometry.n_triangles >= ROWS_BY_KERNEL)
 
     def _upload(self, built: Built) -> WarpStruct:
-        return super()._upload(replace(built, arrays={"nodes": aligned(built.arrays["nodes"])}))
+        nodes = built.arrays["nodes"]
+        return super()._upload(built if isinstance(nodes, wp.array) else replace(built, arrays={"nodes": aligned(nodes)}))
+
+    def _copied(self, built: Built) -> Built:
+        built = built.on_host()
+        nodes = empty_aligned(built.arrays["nodes"].shape, np.float32)
+        nodes[:] = built.arrays["nodes"]
+        return replace(built, arrays={"nodes": upload(nodes, wp.float32, self.device)},
+                       order=upload(built.order.copy(), wp.int32, self.device))
+
+    def _cost(self, built: Built) -> float:
+        tree = self._tree(built)
+        return tree.sah_cost(tree.root_area)
+
+    def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
+        from wrt.kernels.build.wide_fit import Tree, make_fit  # imported when it is needed, as rows_kernel is
+
+        host, data, device = built.on_host(), self.data, self.device
+        references, starts = self._references(host), self._starts(host)
+        fitting = Fitting(device, len(self.geometry), 0)
+        inner = np.flatnonzero(references > 0)
+        up = np.full(len(references), -1, np.int32)
+        up[references.reshape(-1)[inner]] = inner
+        tree = Tree()
+        tree.nodes = tree.boxes = data.nodes
+        if self.compressed:
+            boxes = np.tile(np.float32([np.inf, -np.inf] * 3)[:, None], (len(references), 1, self.width))
+            tree.boxes = upload(boxes.reshape(-1), wp.float32, device)
+        tree.up, tree.children, tree.starts = (upload(each, wp.int32, device) for each in (up, (references != EMPTY).sum(axis=1), starts))
+        tree.arrived = wp.zeros(len(references), dtype=wp.int32, device=device)
+        tree.order, tree.low, tree.high = built.order, fitting.low, fitting.high
+        fit = make_fit(self.width, self.compressed)
+
+        def run() -> None:
+            fitting.find_bounds(shape, self.threads)
+            launch_on(device, fit, references.size, tree, None, threads=self.threads, step=SLOTS_PER_JOB, captured=True)
+            if len(shape.faces):  # records of spheres do not change
+                launch_on(device, rows_kernel(), len(starts) - 1, shape, tree.order, tree.starts, self.width, data.primitives, None,
+                          threads=self.threads, step=4 * ROWS_PER_JOB, captured=True)
+
+        return run
 
     def _check(self, built: Built) -> None:
         if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):
