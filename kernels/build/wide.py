@@ -8,7 +8,7 @@ import warp as wp
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.units.box import half_area
-from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
+from wrt.kernels.wide.references import EMPTY, leaf_reference
 
 MAX_WIDTH = wp.constant(8)
 
@@ -317,29 +317,3 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     out.count[0] = n_nodes
     out.count[2] = n_leaves
     out.count[3] = depth
-
-
-@kernel
-def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), width: int, low: wp.array(dtype=wp.vec3),
-          high: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
-    """Refit the boxes lo, hi of all children to moved primitives in one thread, from the last node to the first.
-    The arrays low, high have a box for each prim_id. Their last entry is an empty box, for entries -1 of `order` (no primitive)."""
-    n = children.shape[0]
-    none = low.shape[0] - 1
-    for k in range(n):
-        i = n - 1 - k
-        reference = children[i]
-        a = wp.vec3(wp.inf, wp.inf, wp.inf)
-        b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-        if reference < 0:
-            first = leaf_first(reference) * width
-            for j in range(first, first + leaf_count(reference)):
-                prim_id = wp.where(order[j] < 0, none, order[j])
-                a = wp.min(a, low[prim_id])
-                b = wp.max(b, high[prim_id])
-        elif reference != EMPTY:
-            for j in range(reference * width, reference * width + width):
-                a = wp.min(a, lo[j])
-                b = wp.max(b, hi[j])
-        lo[i] = a
-        hi[i] = b

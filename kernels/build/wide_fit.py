@@ -1,5 +1,5 @@
 """Fit the boxes of a wide BVH to moved primitives, in place and in one launch, on the CPU and on CUDA. One thread begins at each leaf.
-Of the threads that meet at a node, the last one continues with the box around its children. The bits are those of build.wide.refit and
+Of the threads that meet at a node, the last one continues with the box around its children. Compressed nodes are described in
 wrt.accel.bvh.compress."""
 
 from functools import cache
@@ -51,52 +51,50 @@ def load_around(boxes: wp.array(dtype=wp.float32), first: int, width: int, lo: w
 @wp.func_native("""
     float* const node = nodes.data + (long long)i * size;
     const volatile float* const planes = boxes.data + (long long)i * 6 * width;
-    unsigned char* const bytes = (unsigned char*)(node + 4);
+    const auto power = [](unsigned exponent) { float step; exponent <<= 23; memcpy(&step, &exponent, 4); return step; };
     unsigned word;
     memcpy(&word, node + 3, 4);
-    const unsigned exist = word >> 24;
+    const unsigned exist = word >> 24, nan = 0x7fc00000;
     word = exist << 24;
     for (int axis = 0; axis < 3; ++axis) {
-        const double extent = (double)hi[axis] - lo[axis];
-        const bool finite = extent - extent == 0.0;
-        float origin = lo[axis], step;
-        unsigned exponent = 1;
-        if (finite && extent > 0.0) {
-            const double part = extent / 255.0;
-            unsigned long long word_of_part;
-            memcpy(&word_of_part, &part, 8);
-            const int biased = (int)(word_of_part >> 52) - 1023 + 127;
-            exponent = biased < 1 ? 1 : biased > 255 ? 255 : biased;
-            for (int k = 0; k < 3; ++k) {
-                const unsigned step_word = exponent << 23;
-                memcpy(&step, &step_word, 4);
-                if (!(origin + 255.0f * step >= hi[axis]) && exponent < 255) ++exponent;
-            }
-        }
-        const bool coarse = !finite || exponent == 255;
-        const unsigned nan = 0x7fc00000, step_word = (coarse ? 1 : exponent) << 23;
-        memcpy(&step, &step_word, 4);
+        const float low = lo[axis] <= hi[axis] ? lo[axis] : 0.0f, high = lo[axis] <= hi[axis] ? hi[axis] : 0.0f;  // 0: no children
+        const double extent = (double)high - low, part = extent / 255.0;
+        unsigned long long part_word;
+        memcpy(&part_word, &part, 8);
+        const int biased = extent > 0.0 ? (int)(part_word >> 52) - 1023 + 127 : 1;
+        unsigned exponent = biased < 1 ? 1 : biased > 255 ? 255 : biased;
+        for (int k = 0; k < 3; ++k) exponent += !(low + 255.0f * power(exponent) >= high) && exponent < 255;
+        const bool coarse = extent - extent != 0.0 || exponent == 255;
+        const float origin = coarse ? 0.0f : low, step = power(coarse ? 1 : exponent);
         word |= (coarse ? 1 : exponent) << (8 * axis);
-        origin = coarse ? 0.0f : origin;
         memcpy(node + axis, coarse ? (const void*)&nan : (const void*)&origin, 4);
-        for (int k = 2 * axis; k < 2 * axis + 2; ++k)
-            for (int lane = 0; lane < width; ++lane) {
-                const float wanted = !coarse && (exist >> lane & 1) ? planes[k * width + lane] : lo[axis];
-                const double t = ((double)wanted - origin) / step;
-                double byte = t - t != 0.0 ? 0.0 : k & 1 ? ceil(t) : floor(t);
-                for (int turn = 0; turn < 3; ++turn) {
-                    byte = byte < 0.0 ? 0.0 : byte > 255.0 ? 255.0 : byte;
-                    const float plane = origin + (float)byte * step;
-                    if (turn < 2) byte += k & 1 ? (plane < wanted ? 1.0 : 0.0) : (plane > wanted ? -1.0 : 0.0);
-                }
-                bytes[k * width + lane] = (unsigned char)byte;
+        for (int lane = 0; lane < 2 * width; ++lane) {
+            const bool up = lane >= width, own = !coarse && (exist >> lane % width & 1);
+            const float wanted = own ? planes[2 * width * axis + lane] : low;
+            const double t = ((double)wanted - origin) / step;
+            double byte = t - t != 0.0 ? 0.0 : up ? ceil(t) : floor(t);
+            for (int turn = 0; turn < 3; ++turn) {
+                byte = byte < 0.0 ? 0.0 : byte > 255.0 ? 255.0 : byte;
+                const float plane = origin + (float)byte * step;
+                if (turn < 2) byte += up ? (plane < wanted) : -(plane > wanted);
             }
+            ((unsigned char*)(node + 4))[2 * width * axis + lane] = (unsigned char)byte;
+        }
     }
     memcpy(node + 3, &word, 4);
 """)
 def compress(nodes: wp.array(dtype=wp.float32), boxes: wp.array(dtype=wp.float32), i: int, width: int, size: int, lo: wp.vec3,
              hi: wp.vec3) -> None:
     """Write the planes of compressed node i, whose children have the exact planes boxes[6 * width * i ...] and are within lo, hi."""
+
+
+@kernel
+def compress_all(nodes: wp.array(dtype=wp.float32), boxes: wp.array(dtype=wp.float32), width: int, size: int):
+    """Write the planes of all compressed nodes around exact boxes, with one thread per node. Missing children have empty boxes."""
+    i = wp.tid()
+    lo, hi = wp.vec3(), wp.vec3()
+    load_around(boxes, 6 * width * i, width, lo, hi)
+    compress(nodes, boxes, i, width, size, lo, hi)
 
 
 @cache

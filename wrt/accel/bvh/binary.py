@@ -103,22 +103,15 @@ class Bvh2(InPlaceBvh, BinaryBvh):
         fitting.refit(tree_of(fitting, nodes, built.parents, built.order), self._shape(), self.threads)
         return replace(built, arrays={"nodes": nodes}, sah_cost=fitting.root().sah_cost)
 
-    def _copied(self, built: Built) -> Built:
-        built = self._on_device(built)
-        return replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])})
-
     def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
         fitting, data = Fitting(self.device, len(self.geometry), built.nodes), self.data
-        tree = tree_of(fitting, data.nodes, built.parents, built.order)
+        tree = tree_of(fitting, data.nodes, parents_of(data.nodes), built.order)
 
         def run() -> None:
             fitting.refit(tree, shape, self.threads)
             self._write_corners(shape, tree.order, data.primitives)
 
         return run
-
-    def _cost(self, built: Built) -> float:
-        return sah_cost(built.arrays["nodes"])
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
         """Return the triangle test's records.

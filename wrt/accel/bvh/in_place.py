@@ -6,42 +6,28 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import warp as wp
 
 from wrt.accel.base import OneMesh
+from wrt.accel.bvh.builders import expected_cost, half_areas
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import NumberedGeometry
 from wrt.accel.queries.rays import vectors
 from wrt.accel.snapshot import Built
 from wrt.accel.store import save
+from wrt.core.device import aligned, upload
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, PathLike, WarpArray, WarpStruct
-
-
-class InPlace(NamedTuple):
-    """What refits in place need. data: the structure's arrays; shape: kernels.build.shape.Shape, which receives the new points."""
-
-    data: WarpStruct
-    shape: WarpStruct
-    run: Callable[[], None]  # Fits `data` to `shape`.
+from wrt.kernels.warp_private import fields_of
 
 
 class InPlaceBvh(OneMesh):
     """A BVH that can be refitted in place."""
 
     @abstractmethod
-    def _copied(self, built: Built) -> Built:
-        """Return `built` with copies of its arrays on the device."""
-
-    @abstractmethod
     def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
-        """Return the function that fits self.data to the points of `shape`. built: from `_copied`, with the arrays of self.data."""
-
-    @abstractmethod
-    def _cost(self, built: Built) -> float:
-        """Return the SAH cost of arrays on the host."""
+        """Return the function that fits self.data, the arrays of `built`, to the points of `shape`."""
 
     def _shape(self) -> WarpStruct:
         """Upload the geometry. Its faces are cached on the device."""
@@ -63,29 +49,32 @@ class InPlaceBvh(OneMesh):
                 or isinstance(self.geometry, NumberedGeometry)):
             raise InputError(f"a refit in place needs a Warp array on {self.device}, the watertight triangle test, and no joined objects",
                              argument="vertices")
-        cached: InPlace | None = self._cache.get("in place")
-        if cached is None or cached.data is not self.data:
+        data, own, run = self._cache.get("in place", (None, None, None))
+        if data is not self.data:
             if self.device.is_capturing:
                 raise InputError("a graph cannot capture the first refit in place, which allocates memory",
                                  hint="refit in place once before the capture")
-            cached = self._cache["in place"] = self._begin_in_place(points)
-        wp.copy(cached.shape.vertices, points)
-        cached.run()
+            self._cache["in place"] = _, own, run = self._begin_in_place(points)
+        wp.copy(own, points)
+        run()
 
-    def _begin_in_place(self, points: WarpArray) -> InPlace:
-        """Give the structure arrays that no snapshot shares; return what refits in place need."""
+    def _begin_in_place(self, points: WarpArray) -> tuple[WarpStruct, WarpArray, Callable[[], None]]:
+        """Give the structure arrays that no snapshot shares; return the arrays, the points that `run` fits them to, and `run`."""
         before = self._snapshot
-        built = replace(self._copied(before.arrays), sah_cost=float("nan"))
+        built, kind = before.arrays.on_host(), fields_of(self.data)["nodes"].dtype
+        nodes, order = (aligned(each.copy()) for each in (built.arrays["nodes"], built.order))
+        built = replace(built, arrays={"nodes": upload(nodes, kind, self.device)}, order=upload(order, wp.int32, self.device),
+                        sah_cost=float("nan"))
         moved = DeviceGeometry.unchecked(wp.clone(points), self._shape().faces, self.geometry.spheres)
         beside = self._over(self.geometry, built, before.built_cost)
         self._snapshot = replace(beside.snapshot, geometry=moved, followed=None, changes=True)
-        shape = self._shape()
-        return InPlace(self.data, shape, self._in_place(built, shape))
+        return self.data, moved.points, self._in_place(built, self._shape())
 
     def save(self, path: PathLike, mesh: bool = False) -> None:
         """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""
-        snapshot = self.snapshot
-        built = snapshot.arrays
+        snapshot, built = self.snapshot, self.snapshot.arrays
         if math.isnan(built.sah_cost):
-            snapshot = replace(snapshot, built=replace(built, sah_cost=self._cost(built.on_host())))
+            tree = self._box_tree(built.on_host())
+            root = float(half_areas(tree.lo[0].min(axis=0), tree.hi[0].max(axis=0)))
+            snapshot = replace(snapshot, built=replace(built, sah_cost=expected_cost(root, half_areas(tree.lo, tree.hi), tree.count)))
         save(snapshot, path, mesh)

@@ -23,6 +23,8 @@ from wrt.accel.bvh.wide_tree import (
     check_wide,
     collapse,
     collapse_kernels,
+    fit,
+    fit_inputs,
     lanes_of,
     one_leaf,
     packed,
@@ -44,7 +46,6 @@ from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
-SLOTS_PER_JOB = 1 << 16
 SMALL = 128  # primitives: so few trees are built in one launch, and without reinsertion, which gains nothing there
 BINARY = 0.8  # share of a build's time after which the binary tree is finished, for large meshes
 ROWS_BY_KERNEL = 1 << 15  # triangles
@@ -135,7 +136,7 @@ class CollapsedBvh(OneMesh):
 
     def _refit(self, built: Built) -> Built:
         built = built.on_host()
-        tree = refit(self._tree(built), self.geometry)
+        tree = refit(self._tree(built), self.geometry, self.threads)
         built = replace(built, arrays=self._arrays(tree))
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
@@ -228,41 +229,20 @@ class WideBvh(InPlaceBvh, CollapsedBvh):
         nodes = built.arrays["nodes"]
         return super()._upload(built if isinstance(nodes, wp.array) else replace(built, arrays={"nodes": aligned(nodes)}))
 
-    def _copied(self, built: Built) -> Built:
-        built = built.on_host()
-        nodes = empty_aligned(built.arrays["nodes"].shape, np.float32)
-        nodes[:] = built.arrays["nodes"]
-        return replace(built, arrays={"nodes": upload(nodes, wp.float32, self.device)},
-                       order=upload(built.order.copy(), wp.int32, self.device))
-
-    def _cost(self, built: Built) -> float:
-        tree = self._tree(built)
-        return tree.sah_cost(tree.root_area)
-
     def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
-        from wrt.kernels.build.wide_fit import Tree, make_fit  # imported when it is needed, as rows_kernel is
-
-        host, data, device = built.on_host(), self.data, self.device
-        references, starts = self._references(host), self._starts(host)
-        fitting = Fitting(device, len(self.geometry), 0)
-        inner = np.flatnonzero(references > 0)
-        up = np.full(len(references), -1, np.int32)
-        up[references.reshape(-1)[inner]] = inner
-        tree = Tree()
+        host, data = built.on_host(), self.data
+        references, starts, fitting = self._references(host), self._starts(host), Fitting(self.device, len(self.geometry), 0)
+        tree = fit_inputs(references, built.order, starts, fitting)
         tree.nodes = tree.boxes = data.nodes
         if self.compressed:
-            boxes = np.tile(np.float32([np.inf, -np.inf] * 3)[:, None], (len(references), 1, self.width))
-            tree.boxes = upload(boxes.reshape(-1), wp.float32, device)
-        tree.up, tree.children, tree.starts = (upload(each, wp.int32, device) for each in (up, (references != EMPTY).sum(axis=1), starts))
-        tree.arrived = wp.zeros(len(references), dtype=wp.int32, device=device)
-        tree.order, tree.low, tree.high = built.order, fitting.low, fitting.high
-        fit = make_fit(self.width, self.compressed)
+            boxes = np.tile(np.array([np.inf, -np.inf] * 3, np.float32)[:, None], (len(references), 1, self.width))
+            tree.boxes = upload(boxes.reshape(-1), wp.float32, self.device)
 
         def run() -> None:
             fitting.find_bounds(shape, self.threads)
-            launch_on(device, fit, references.size, tree, None, threads=self.threads, step=SLOTS_PER_JOB, captured=True)
+            fit(tree, self.width, self.compressed, self.threads)
             if len(shape.faces):  # records of spheres do not change
-                launch_on(device, rows_kernel(), len(starts) - 1, shape, tree.order, tree.starts, self.width, data.primitives, None,
+                launch_on(self.device, rows_kernel(), len(starts) - 1, shape, tree.order, tree.starts, self.width, data.primitives, None,
                           threads=self.threads, step=4 * ROWS_PER_JOB, captured=True)
 
         return run

@@ -7,14 +7,17 @@ import warp as wp
 
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.bvh.builders import BinaryTree, expected_cost, half_areas
+from wrt.accel.bvh.refit import Fitting
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_launches import launch_raw
-from wrt.core.device import launch, start, upload
+from wrt.core.device import launch_on, start, upload
 from wrt.core.errors import InputError
-from wrt.core.types import Kernel
+from wrt.core.types import Kernel, WarpArray, WarpStruct
 from wrt.core.warp_private import struct_record
-from wrt.kernels.wide.layout import STACK_SIZE
+from wrt.kernels.wide.layout import STACK_SIZE, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
+
+SLOTS_PER_JOB = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,18 +110,38 @@ def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
     return WideTree(lo, hi, children, lanes, int(leaf.sum()), len(tree.levels()))
 
 
-def refit(tree: WideTree, geometry: Geometry) -> WideTree:
-    """Fit the boxes to the geometry. Boxes that spatial splits clipped become the boxes of whole triangles."""
-    from wrt.kernels.build import wide as build_wide
+def fit_inputs(children: np.ndarray, order: WarpArray, starts: np.ndarray, fitting: Fitting) -> WarpStruct:
+    """Return a kernels.build.wide_fit.Tree without nodes and boxes. children: references (N, width); starts: see `row_starts`."""
+    from wrt.kernels.build.wide_fit import Tree
 
-    cpu = start("cpu")
-    width = tree.children.shape[1]
-    low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box
-                 for box, end in zip(geometry.bounds(), (np.inf, -np.inf), strict=True))
-    lo, hi = (wp.empty(tree.children.size, dtype=wp.vec3, device=cpu) for _ in range(2))
-    launch(build_wide.refit, 1, upload(tree.children.reshape(-1).copy(), wp.int32, cpu),
-           upload(tree.order.reshape(-1).copy(), wp.int32, cpu), width, low, high, lo, hi)
-    return replace(tree, lo=lo.numpy().reshape(-1, width, 3), hi=hi.numpy().reshape(-1, width, 3))
+    tree, inner, up = Tree(), np.flatnonzero(children > 0), np.full(len(children), -1, np.int32)
+    up[children.reshape(-1)[inner]] = inner
+    tree.up, tree.children, tree.starts = (upload(each, wp.int32, order.device) for each in (up, (children != EMPTY).sum(axis=1), starts))
+    tree.arrived, tree.order = wp.zeros(len(children), dtype=wp.int32, device=order.device), order
+    tree.low, tree.high = fitting.low, fitting.high
+    return tree
+
+
+def fit(tree: WarpStruct, width: int, compressed: bool, threads: int) -> None:
+    """Fit a kernels.build.wide_fit.Tree to the boxes of primitives. A graph can capture this."""
+    from wrt.kernels.build.wide_fit import make_fit
+
+    launch_on(tree.nodes.device, make_fit(width, compressed), width * len(tree.up), tree, None, threads=threads, step=SLOTS_PER_JOB,
+              captured=True)
+
+
+def refit(tree: WideTree, geometry: Geometry, threads: int) -> WideTree:
+    """Fit the boxes to the geometry. Boxes that spatial splits clipped become the boxes of whole triangles."""
+    (n, width), cpu = tree.children.shape, start("cpu")
+    nodes = np.zeros((n, node_size(width, False) // width, width), np.float32)
+    nodes[:, :6:2], nodes[:, 1:6:2], nodes[:, 6] = np.inf, -np.inf, tree.children.view(np.float32)
+    fitting, order = Fitting(cpu, len(geometry), 0), upload(tree.order[tree.order >= 0], wp.int32, cpu)
+    inputs = fit_inputs(tree.children, order, row_starts(tree.children, width), fitting)
+    inputs.nodes = inputs.boxes = upload(nodes.reshape(-1), wp.float32, cpu)
+    fitting.find_bounds(geometry.on(cpu), threads)
+    fit(inputs, width, False, threads)
+    lo, hi = (np.ascontiguousarray(nodes[:, end:6:2].transpose(0, 2, 1)) for end in range(2))
+    return replace(tree, lo=lo, hi=hi)
 
 
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
