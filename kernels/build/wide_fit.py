@@ -55,7 +55,7 @@ def load_around(boxes: wp.array(dtype=wp.float32), first: int, width: int, lo: w
     unsigned word;
     memcpy(&word, node + 3, 4);
     const unsigned exist = word >> 24, nan = 0x7fc00000;
-    word = exist << 24;
+    word &= 0xff000000;
     for (int axis = 0; axis < 3; ++axis) {
         const float low = lo[axis] <= hi[axis] ? lo[axis] : 0.0f, high = lo[axis] <= hi[axis] ? hi[axis] : 0.0f;  // 0: no children
         const double extent = (double)high - low, part = extent / 255.0;
@@ -112,8 +112,7 @@ def make_fit(width: int, compressed: bool) -> Any:
         begin = leaf_first(reference)
         if wp.static(not compressed):
             begin = tree.starts[begin]
-        lo = wp.vec3(wp.inf, wp.inf, wp.inf)
-        hi = -lo
+        lo, hi = wp.vec3(wp.inf, wp.inf, wp.inf), wp.vec3(-wp.inf, -wp.inf, -wp.inf)
         for j in range(begin, begin + leaf_count(reference)):
             lo = lower(lo, tree.low[tree.order[j]])
             hi = upper(hi, tree.high[tree.order[j]])

@@ -125,7 +125,7 @@ def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
     points, larger = (wp.array(scale * ball.vertices, dtype=wp.vec3, device="cuda:0") for scale in (1.0, 2.0))
     mesh = wrt.DeviceGeometry(points, wp.array(ball.faces.reshape(-1), dtype=wp.int32, device="cuda:0"))
     bvh2 = [wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0") for _ in range(2)]
-    bvh8 = wrt.build(ball, device="cuda:0")
+    bvh8, fitted = (wrt.build(ball, device="cuda:0") for _ in range(2))
     worlds, in_place = (wrt.build([wrt.Scene.of([ball] * n) for n in (1, 2)], device="cuda:0") for _ in range(2))
     matrices = np.tile(np.eye(4), (3, 1, 1))
     poses = wp.array(matrices, dtype=wp.mat44f, device="cuda:0")
@@ -139,6 +139,7 @@ def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
         "wrt.build(mesh)": lambda: wrt.build(ball, device="cuda:0"),
         "bvh2.refit(points)": lambda: bvh2[0].refit(larger),
         "bvh2.refit(points, in_place=True)": lambda: bvh2[1].refit(larger, in_place=True),
+        "bvh8.refit(points, in_place=True)": lambda: fitted.refit(larger, in_place=True),
         "bvh8.refit(points)": lambda: bvh8.refit(larger),
         "worlds.move(rows, matrices) of NumPy": lambda: worlds.move(np.arange(3), matrices),
         "worlds.move(poses)": lambda: in_place.move(poses),

@@ -101,8 +101,8 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points(name: str, monke
         assert gpus().counts.copies - copies == {"d2d": 1}
         expected = wrt.build(wrt.Mesh(np.float32(scale) * BALL.vertices, BALL.faces), name, device="cpu").closest_hit(
             rays[0].numpy(), rays[1].numpy(), t_max=5.0)
-        for name in FIELDS:
-            assert getattr(out, name).numpy().tobytes() == getattr(expected, name).tobytes()
+        for field in FIELDS:
+            assert getattr(out, field).numpy().tobytes() == getattr(expected, field).tobytes()
         assert (expected.prim_id >= 0).any()
 
 
