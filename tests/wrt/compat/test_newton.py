@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+import wrt
 from tests.refused import refused
 from wrt.compat.newton import ModelScene, from_newton
 from wrt.core.errors import SceneWarning
@@ -192,6 +193,35 @@ def nearest(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) ->
         u, v, t = ((o - a) * p).sum(axis=2) * inverse, (d * q).sum(axis=2) * inverse, (e2 * q).sum(axis=2) * inverse
         t = np.where((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t >= 0.0), t, np.inf)
     return t.min(axis=1), t.argmin(axis=1)
+
+
+def test_pictures_of_a_sensor_beside_newtons_camera() -> None:
+    """The rows of docs/compat.md on SensorCamera."""
+    model, width, height, fov = model_of(CURVED), 48, 32, 1.0
+    camera, found, state = newton.sensors.SensorCamera(model), from_newton(model), stirred(model, 5)
+    found.follow(state)
+    model.bvh_refit_shapes(state)
+    pose = wp.transform((0.3, -3.5, 2.0), wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 1.4))
+    kinds = {"depth_image": wp.float32, "forward_depth_image": wp.float32, "shape_index_image": wp.uint32, "normal_image": wp.vec3}
+    images = {name: wp.zeros((WORLDS, height, width), dtype=kind) for name, kind in kinds.items()}
+    camera.update(state, wp.array([pose] * WORLDS, dtype=wp.transformf), camera.compute_camera_rays_pinhole(width, height, camera_fov=fov),
+                  render_config=camera.RenderConfig(enable_backface_culling=False, enable_fast_math=False), **images)
+    theirs = {name: image.numpy() for name, image in images.items()}
+    f, numbers = 0.5 * height / np.tan(0.5 * fov), np.array([pose])
+    turned = compose(numbers[:, :3], numbers[:, 3:], np.ones((1, 3))) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    sensor = wrt.sensors.pinhole([[f, 0, 0.5 * width - 0.5], [0, f, 0.5 * height - 0.5], [0, 0, 1]], (width, height),
+                                 np.repeat(turned, WORLDS, axis=0))
+    world = np.repeat(np.arange(WORLDS), width * height)
+    hits = found.accel.closest_hit(sensor.origins, sensor.directions, world=world)
+    shape = np.where(hits.hit, found.shape[hits.instance], -1).reshape(WORLDS, height, width)
+    same = shape == theirs["shape_index_image"].view(np.int32)
+    assert (~same).sum() <= 6 and len(np.unique(shape)) > 15  # rims, and barrels
+    seen = same & (shape >= 0)
+    for name, own in (("depth_image", sensor.range(hits)), ("forward_depth_image", sensor.depth(hits))):
+        error = np.abs(theirs[name] - own)[seen]
+        assert error.max() < 0.05 and (error < 2e-3).mean() > 0.995
+    normal = hits.shading_normal.reshape(WORLDS, height, width, 3)
+    assert (np.linalg.norm(theirs["normal_image"] - normal, axis=3)[seen] < 0.05).mean() > 0.998
 
 
 def test_a_graph_follows_bodies() -> None:
