@@ -223,34 +223,50 @@ def advance(poses: wp.array(dtype=wp.transformf), origins: wp.array(dtype=wp.vec
 
 
 @wp.kernel(enable_backward=False)
+def swell(points: wp.array(dtype=wp.vec3)) -> None:  # type: ignore[valid-type]
+    i = wp.tid()
+    points[i] = (1.0 + 0.1 * wp.sin(float(i))) * points[i]
+
+
+@wp.kernel(enable_backward=False)
 def use(t: wp.array(dtype=float), ids: wp.array(dtype=int), hidden: wp.array(dtype=wp.bool), out: wp.array(dtype=float)) -> None:  # type: ignore[valid-type]
     i = wp.tid()
     wp.atomic_add(out, ids[i] + 1, wp.where(hidden[i], 1.0 + wp.min(t[i], 100.0), -1.0))
 
 
 @pytest.mark.skipif(DEVICE.is_cuda, reason="tests/virtual_gpu/test_graphs.py has it")
-@pytest.mark.parametrize(("kind", "over_worlds"), [("bvh8", True), ("bvh8", False), ("bvh2", True)])
-def test_a_step_is_one_graph_of_the_cpu(kind: str, over_worlds: bool) -> None:
-    """Moves, queries and the user's kernels: each replay has the bits of eager calls, also if only the graph keeps the arrays that the
-    calls made."""
+@pytest.mark.parametrize(("kind", "form"), [("bvh8", "worlds"), ("bvh8", "instances"), ("bvh8", "mesh"), ("bvh2", "worlds")])
+def test_a_step_is_one_graph_of_the_cpu(kind: str, form: str) -> None:
+    """Moves or a refit in place, queries and the user's kernels: each replay has the bits of eager calls, also if only the graph keeps the
+    arrays that the calls made."""
     scenes = [wrt.Scene.of([BALL] * n) for n in (2, 3)]
     n = 2 * 1500  # more than the buffers of a call with few rays
 
     class Step:
         def __init__(self) -> None:
-            self.accel = wrt.build(scenes, kind) if over_worlds else wrt.build(scenes[1], kind, movable=True)
+            scene = {"worlds": scenes, "instances": scenes[1], "mesh": BALL}[form]
+            self.accel: Any = wrt.build(scene, kind, movable=form == "instances")
             rays = np.random.default_rng(4).normal(size=(2, n, 3))
             self.rays = [wp.array(each, dtype=wp.vec3, device="cpu") for each in rays]
-            self.options = {"world": wp.array(np.arange(n) % 3, dtype=wp.int32, device="cpu")} if over_worlds else {}  # 2 does not exist
-            self.poses = wp.zeros(5 if over_worlds else 3, dtype=wp.transformf, device="cpu")
+            world = wp.array(np.arange(n) % 3, dtype=wp.int32, device="cpu")  # 2 does not exist
+            self.options = {"world": world} if form == "worlds" else {}
+            self.points = wp.array(BALL.vertices, dtype=wp.vec3, device="cpu")
+            self.poses = wp.zeros(5 if form == "worlds" else 3, dtype=wp.transformf, device="cpu")
             self.poses.assign(np.random.default_rng(5).normal(size=(len(self.poses), 7)))
             self.out, self.sums = wp.zeros(400 * 5, dtype=float, device="cpu"), wp.zeros(400 * 5, dtype=float, device="cpu")
             self.hits = self.accel.closest_hit(*self.rays, **self.options)
-            self.accel.move(self.poses)
+            self.follow()
+
+        def follow(self) -> None:
+            if form == "mesh":
+                self.accel.refit(self.points, in_place=True)
+            else:
+                self.accel.move(self.poses)
 
         def run(self) -> None:
             wp.launch(advance, n, [self.poses, *self.rays], device="cpu")
-            self.accel.move(self.poses)
+            wp.launch(swell, len(self.points), [self.points], device="cpu")
+            self.follow()
             self.accel.closest_hit(*self.rays, 0.25, 5.0, out=self.hits, **self.options)
             hidden = self.accel.any_hit(*self.rays, t_max=self.hits.t, **self.options)
             wp.launch(use, n, [self.hits.t, self.hits.prim_id, hidden, self.sums], device="cpu")
