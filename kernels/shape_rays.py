@@ -36,6 +36,20 @@ def place_shapes(shapes: Shapes, shape_body: wp.array(dtype=wp.int32), shape_pos
 
 
 @kernel
+def place_geoms(geom_of: wp.array(dtype=wp.int32), count: int, hidden: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.float32),
+                turn: wp.array(dtype=wp.float32), poses: wp.array3d(dtype=wp.float32), first: int):
+    """Write the poses of instances. geom_of: the geoms of a world; position, turn: 3 and 9 numbers for each of `count` geoms of each world.
+    The pose of a hidden geom is NaN, so that a move removes its instance."""
+    i = first + wp.tid()
+    row = i % geom_of.shape[0]
+    at = i / geom_of.shape[0] * count + geom_of[row]
+    for k in range(3):
+        for j in range(3):
+            poses[i, k, j] = turn[9 * at + 3 * k + j]
+        poses[i, k, 3] = wp.where(hidden[row] > 0, wp.nan, position[3 * at + k])
+
+
+@kernel
 def known_worlds(given: wp.array(dtype=wp.int32), count: int, world: wp.array(dtype=wp.int32), first: int):
     """Write the world of each ray: `count` for -1, which all worlds share. In other worlds that do not exist, rays miss."""
     i = first + wp.tid()

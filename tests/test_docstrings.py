@@ -14,10 +14,10 @@ import wrt
 from tests.data import ROOT
 
 MODULES = ("wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing", "wrt.compat.trimesh", "wrt.compat.open3d", "wrt.compat.pyvista",
-           "wrt.compat.newton", "wrt.picture.metrics")
+           "wrt.compat.mujoco", "wrt.compat.newton", "wrt.picture.metrics")
 CLASSES = ("wrt.accel.base:OneMesh", "wrt.accel.instances:Instances", "wrt.accel.queries.answers:Hits", "wrt.picture.film:Film",
            "wrt.compat.trimesh:RayMeshIntersector", "wrt.compat.open3d:RaycastingScene", "wrt.compat.pyvista:RayTracer",
-           "wrt.compat.newton:ModelScene")
+           "wrt.compat.mujoco:ModelGeoms", "wrt.compat.newton:ModelScene")
 WITHOUT_SECTIONS = ("wrt.kernels.structs",)  # modules whose docstrings have no sections yet
 NOT_CALLED = ("pytest_addoption", "pytest_generate_tests", "located")  # functions that users do not call
 # Types of results that need no section Returns.

@@ -33,7 +33,7 @@ API = {  # title: objects, of wrt unless the module is named
     "Materials and lights": "Material Texture Checkerboard PointLight DirectionalLight SpotLight ConstantBackground GradientBackground "
                             "EnvironmentBackground",
     "Costs and steps": "profile inspect walk trace",
-    "Other libraries' classes": "compat.trimesh compat.open3d compat.newton",
+    "Other libraries' classes": "compat.trimesh compat.open3d compat.mujoco compat.newton",
     "Testing, errors": "testing InputError SceneWarning",
 }
 FENCED = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)

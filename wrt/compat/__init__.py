@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-_MODULES = ("newton", "open3d", "pyvista", "trimesh")
+_MODULES = ("mujoco", "newton", "open3d", "pyvista", "trimesh")
 
 
 def __getattr__(name: str) -> ModuleType:

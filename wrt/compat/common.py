@@ -1,9 +1,10 @@
-"""What the adapters share: all hits of rays, counted as in other libraries, and the structure over the meshes of a RaycastingScene."""
+"""What the adapters share: all hits of rays, counted as in other libraries, the structure over the meshes of a RaycastingScene, and curved
+shapes of simulators."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.rays import Rays
 from wrt.accel.scenes.build import build
+from wrt.scene import shapes
 from wrt.scene.clean import flip_collinear
+from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.values import near_zero, warn_if_alone, warn_if_far
 
 
@@ -49,6 +52,22 @@ def hit_counts(accel: Accelerator, rays: Rays, threads: int) -> np.ndarray:
 def _touched(accel: Accelerator, rays: Rays, threads: int) -> Hits[np.ndarray]:
     """Return the hits of rays that only touch faces, (N, 1) or (N, 2)."""
     return first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, *rays, threads=threads)
+
+
+def turned(kind: str, size: np.ndarray, segments: int) -> Mesh:
+    """Return a curved shape, a surface of revolution around z."""
+    scale = size if kind == "ELLIPSOID" else np.ones(3)
+    radius, half, barrel = (1.0, 0.0, 0.0) if kind == "ELLIPSOID" else size
+    angle, middle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * (segments // 4) + 1), segments // 4
+    arc = radius * np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1), 15)  # exactly 0 on the axis
+    height = np.linspace(-half, half, len(arc) if barrel > 0.0 else 2)
+    side = radius + np.sqrt(np.maximum(barrel**2 - height**2, 0.0)) - np.sqrt(max(barrel**2 - half**2, 0.0))
+    wall, bottom, top = np.stack([side, height], axis=1), [[0.0, -half]], [[0.0, half]]
+    profiles: Any = {"CAPSULE": np.concatenate([arc[: middle + 1] + bottom, arc[middle:] + top]),
+                     "CYLINDER": np.concatenate([bottom, wall[:1], wall, wall[-1:], top]),  # repeated points are sharp
+                     "CONE": np.concatenate([bottom, wall[:1], wall[:1], top, top])}
+    mesh: Any = shapes.lathe(profiles.get(kind, arc), segments)
+    return Mesh(np.roll(mesh.vertices, 1, axis=1) * scale, mesh.faces, unit_rows(np.roll(mesh.normals, 1, axis=1) / scale))
 
 
 def scatter(found: np.ndarray, valid: np.ndarray | None, missing: object) -> np.ndarray:

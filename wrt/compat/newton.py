@@ -11,6 +11,7 @@ import warp as wp
 
 from wrt.accel.queries.rays import filled
 from wrt.accel.scenes.build import build
+from wrt.compat.common import turned
 from wrt.core.arrays import to_numpy
 from wrt.core.checks import as_integer, shown
 from wrt.core.device import launch_on, upload
@@ -19,7 +20,7 @@ from wrt.core.threads import thread_count
 from wrt.io.gltf.meshes import compose
 from wrt.kernels.shape_rays import Answers, Shapes, known_worlds, place_shapes, write_answers
 from wrt.scene import shapes
-from wrt.scene.mesh import Mesh, unit_rows
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 if TYPE_CHECKING:
@@ -67,22 +68,6 @@ def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 12
     return ModelScene(model, meshes, options)
 
 
-def _turned(kind: str, size: np.ndarray, segments: int) -> Mesh:
-    """Return a curved shape, a surface of revolution around z."""
-    scale = size if kind == "ELLIPSOID" else np.ones(3)
-    radius, half, barrel = (1.0, 0.0, 0.0) if kind == "ELLIPSOID" else size
-    angle, middle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * (segments // 4) + 1), segments // 4
-    arc = radius * np.round(np.stack([np.cos(angle), np.sin(angle)], axis=1), 15)  # exactly 0 on the axis
-    height = np.linspace(-half, half, len(arc) if barrel > 0.0 else 2)
-    side = radius + np.sqrt(np.maximum(barrel**2 - height**2, 0.0)) - np.sqrt(max(barrel**2 - half**2, 0.0))
-    wall, bottom, top = np.stack([side, height], axis=1), [[0.0, -half]], [[0.0, half]]
-    profiles: Any = {"CAPSULE": np.concatenate([arc[: middle + 1] + bottom, arc[middle:] + top]),
-                     "CYLINDER": np.concatenate([bottom, wall[:1], wall, wall[-1:], top]),  # repeated points are sharp
-                     "CONE": np.concatenate([bottom, wall[:1], wall[:1], top, top])}
-    mesh: Any = shapes.lathe(profiles.get(kind, arc), segments)
-    return Mesh(np.roll(mesh.vertices, 1, axis=1) * scale, mesh.faces, unit_rows(np.roll(mesh.normals, 1, axis=1) / scale))
-
-
 def _mesh_of(kind: str, size: np.ndarray, source: Any, segments: int) -> Mesh | None:
     """Return the mesh of a shape with a kind of newton.GeoType, or None if it cannot be traced."""
     if kind == "PLANE":
@@ -93,7 +78,7 @@ def _mesh_of(kind: str, size: np.ndarray, source: Any, segments: int) -> Mesh | 
     if kind in ("MESH", "CONVEX_MESH", "HFIELD") and source is not None:
         vertices, faces = to_numpy(source.points if kind == "HFIELD" else source.vertices), to_numpy(source.indices).reshape(-1, 3)
         return Mesh(vertices * size, faces[:, ::-1] if np.prod(size) < 0.0 else faces)  # the outside stays outside
-    return _turned(kind, size, segments) if kind in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "CONE") else None
+    return turned(kind, size, segments) if kind in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "CONE") else None
 
 
 def _meshes(model: newton.Model, chosen: list[int], segments: int) -> dict[int, Mesh]:

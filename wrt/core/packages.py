@@ -9,7 +9,8 @@ from wrt.core.errors import InputError
 INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "mapbox_earcut": "mapbox-earcut"}
 # Modules that only an extra of wrt installs, and the extra; tests/wrt/core/test_packages.py compares with pyproject.toml.
 EXTRAS = {"distributed": "cluster", "embreex": "peers", "jax": "jax", "matplotlib": "plots",
-          "mitsuba": "peers", "newton": "newton", "pyvista": "pyvista", "torch": "torch", "websockets": "viewer"}
+          "mitsuba": "peers", "mujoco": "mujoco", "newton": "newton", "pyvista": "pyvista", "torch": "torch",
+          "websockets": "viewer"}
 
 
 @contextmanager
