@@ -30,6 +30,8 @@ class HitLists:
     # Of the placement that ray i is in now (kernels.traverse.instances): the results of local_scale, and face index minus prim_id.
     scale: wp.array(dtype=wp.float64)
     to_face: wp.array(dtype=wp.int32)
+    exclude: wp.array(dtype=wp.int32)  # exclude, mask: of the structs.Filter of ray i; only with Units.filtered.
+    mask: wp.array(dtype=wp.int32)
     end: wp.array(dtype=wp.float32)  # t, in world space, behind which the walk of ray i needs no hits.
 
 

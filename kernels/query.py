@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Hit, Ray, Surfaces, kernel, query_kernel
+from wrt.kernels.structs import Filter, Hit, Ray, Surfaces, kernel, query_kernel
 
 LARGEST = wp.constant(3.4028234663852886e38)  # Largest finite float32.
 FARTHEST = 1e37  # Largest absolute coordinate of an origin in a NumPy array: the difference of two coordinates stays finite.
@@ -32,6 +32,19 @@ class WorldRays:
     t_min: wp.array(dtype=wp.float32)
     t_max: wp.array(dtype=wp.float32)
     world: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class FilteredRays:
+    """Rays of a query, as in WorldRays, and their structs.Filter; these arrays may have stride 0, too."""
+
+    origin: wp.array(dtype=wp.vec3)
+    direction: wp.array(dtype=wp.vec3)
+    t_min: wp.array(dtype=wp.float32)
+    t_max: wp.array(dtype=wp.float32)
+    world: wp.array(dtype=wp.int32)
+    exclude: wp.array(dtype=wp.int32)
+    mask: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -119,6 +132,8 @@ class Worlds:
 
     id: wp.array(dtype=wp.int32)  # Index of each ray's world; with a stride of 0, one world for all rays.
     root: wp.array(dtype=wp.int32)  # Index of each world's root node.
+    exclude: wp.array(dtype=wp.int32)  # exclude, mask: of each ray's structs.Filter. Read only if the traversal is filtered.
+    mask: wp.array(dtype=wp.int32)
 
 
 @wp.func
@@ -133,14 +148,21 @@ def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
     return ray
 
 
-def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Make the kernel that traces each ray in its own world. Its argument `out` is HitArrays or, with any_hit, an array of bool."""
+def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool, filtered: bool) -> Any:
+    """Make the kernel that traces each ray in its own world. filtered: see Units.
+    Its argument `out` is HitArrays or, with any_hit, an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @query_kernel
     def trace_worlds(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, worlds: Worlds, out: out_type, first: int):
         i = first + wp.tid()
-        hit = traverse(accel, surfaces, load_ray_of_world(rays, worlds, i))
+        if wp.static(filtered):
+            unseen = Filter()
+            unseen.exclude = worlds.exclude[i]
+            unseen.mask = worlds.mask[i]
+            hit = traverse(accel, unseen, load_ray_of_world(rays, worlds, i))
+        else:
+            hit = traverse(accel, surfaces, load_ray_of_world(rays, worlds, i))
         if wp.static(any_hit):
             out[i] = hit.prim_id >= 0
         else:

@@ -2,12 +2,13 @@
 The functions scale very short and long directions (query.direction_scale) and traverse the structure for one ray. In a kernel without fused
 multiply-add (structs.kernel), their hits equal those of Accelerator.closest_hit to the last bit."""
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from wrt.kernels.query import direction_scale, scaled_ray
-from wrt.kernels.structs import Hit, Ray, Surfaces
+from wrt.kernels.structs import Filter, Hit, Ray, Surfaces
 
 
 @wp.struct
@@ -19,6 +20,8 @@ class QueryRay:
     t_min: float  # At least 0, in units of |direction|.
     t_max: float  # In units of |direction|; may be inf.
     world: int  # Index of the world that the ray sees, in a structure over worlds; in a world that does not exist, it hits nothing.
+    exclude: int  # exclude, mask: see structs.Filter. Only functions of `wrt.ray_query(accel, filtered=True)` read them.
+    mask: int
 
 
 @wp.struct
@@ -34,11 +37,13 @@ class QueryHit:
 
 @wp.func
 def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
-    """Make a ray from `origin` to infinity: t_min = 0, t_max = inf."""
+    """Make a ray from `origin` to infinity: t_min = 0, t_max = inf. It sees all instances of world 0."""
     ray = QueryRay()
     ray.origin = origin
     ray.direction = direction
     ray.t_max = float(wp.inf)
+    ray.exclude = -1
+    ray.mask = -1
     return ray
 
 
@@ -112,12 +117,13 @@ class Traversals(NamedTuple):
     any_of: Any
     resuming: Any  # Made with Units.resumes.
     instances: bool  # True for structures with instances, whose World has the roots of its worlds.
+    filtered: bool  # True if they are made with Units.filtered.
     kind: int  # Identifies these traversals: a World with another `kind` is rejected at run time.
 
 
-def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
-    """Make World, closest_hit, any_hit and next_hit."""
-    struct, closest, any_of, resuming, instances, kind = traversals
+@cache
+def make_world(struct: Any) -> Any:
+    """Make World for a type of structures."""
 
     @wp.struct
     class World:
@@ -128,6 +134,29 @@ def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
         surfaces: Surfaces
         roots: wp.array(dtype=wp.int32)  # Index of each world's root; only with instances.
         origin: wp.vec3d  # The point that is 0 for the structure: Accelerator.origin.
+
+    return World
+
+
+def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
+    """Make World, closest_hit, any_hit and next_hit."""
+    struct, closest, any_of, resuming, instances, filtered, kind = traversals
+    World = make_world(struct)
+
+    def make_trace(traverse: Any) -> Any:
+        @wp.func
+        def trace(world: World, ray: QueryRay, going: Ray) -> Hit:
+            if wp.static(filtered):
+                seen = Filter()
+                seen.exclude = ray.exclude
+                seen.mask = ray.mask
+                return traverse(world.accel, seen, going)
+            else:
+                return traverse(world.accel, world.surfaces, going)
+
+        return trace
+
+    closest, any_of, resuming = map(make_trace, (closest, any_of, resuming))
 
     @wp.func
     def prepared(world: World, ray: QueryRay) -> Ray:
@@ -144,12 +173,12 @@ def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
         """Return the closest hit in the ray's segment; of hits at equal t, the one with the lowest prim_id."""
-        return make_query_hit(closest(world.accel, world.surfaces, prepared(world, ray)), ray.direction)
+        return make_query_hit(closest(world, ray, prepared(world, ray)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
         """Return True if the ray hits anything in its segment."""
-        hit = any_of(world.accel, world.surfaces, prepared(world, ray))
+        hit = any_of(world, ray, prepared(world, ray))
         return hit.prim_id >= 0
 
     @wp.func
@@ -160,6 +189,6 @@ def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
         going = prepared(world, ray)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1
-        return make_query_hit(resuming(world.accel, world.surfaces, going), ray.direction)
+        return make_query_hit(resuming(world, ray, going), ray.direction)
 
     return World, closest_hit, any_hit, next_hit

@@ -119,6 +119,14 @@ class Ray:
     first_prim: int  # Inside an instance: the offset to add to prim_id. Above instances: root node of the ray's world.
 
 
+@wp.struct
+class Filter:
+    """Instances that a ray does not see (Units.filtered)."""
+
+    exclude: int  # Value of Instances.bodies that the ray passes through; -1: none.
+    mask: int  # Bits, of which an instance that the ray sees has at least one in Instances.masks.
+
+
 @wp.func
 def any_positive(v: wp.vec3) -> bool:
     """Test whether a component is above 0; NaN is not. A test with wp.max takes three times as long."""

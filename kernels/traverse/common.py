@@ -19,6 +19,7 @@ class Units(NamedTuple):
     observer: str = ""  # How a walk is observed (kernels.traverse.observer): "" (not at all), "sum", or "log".
     instances: bool = False  # True if the structure is placed by instances: Ray.first_prim is added to each prim_id.
     resumes: bool = False  # True to resume behind a hit: a hit at t_min counts only if prim_id >= Ray.slot. No spheres.
+    filtered: bool = False  # True to pass through instances by body and mask. `surfaces` is structs.Filter, or with lists HitLists.
     lists: bool = False  # True to list all hits (kernels.hit_lists) instead of the best hit.
 
     @property

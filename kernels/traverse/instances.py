@@ -39,6 +39,9 @@ def make_struct(bottom: Any) -> Any:
         roots: wp.array(dtype=wp.int32)  # Index in `wide` of each world's root.
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
+        ids: wp.array(dtype=wp.int32)  # Value of hits.instance of each placement.
+        bodies: wp.array(dtype=wp.int32)  # By the value of hits.instance: a number that a ray can exclude.
+        masks: wp.array(dtype=wp.int32)  # By the value of hits.instance: bits of which a ray must share one.
         bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).
         slack: wp.array(dtype=float)  # For the root of each tree in `nodes`: factor by which `enter` widens boxes.
         recorder: Recorder
@@ -138,14 +141,34 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     return out
 
 
+def make_sees(lists: bool, struct: Any) -> Any:
+    """Make sees(accel, surfaces, ray, placement), which tests whether a ray sees a placement; lists: see Units."""
+
+    @wp.func
+    def sees(accel: struct, surfaces: Any, ray: Ray, placement: int) -> bool:
+        id = accel.ids[placement]
+        if wp.static(lists):
+            exclude = surfaces.exclude[ray.slot]
+            mask = surfaces.mask[ray.slot]
+        else:
+            exclude = surfaces.exclude
+            mask = surfaces.mask
+        return (exclude == -1 or accel.bodies[id] != exclude) and (accel.masks[id] & mask) != 0
+
+    return sees
+
+
 def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> Any:
     """Make visit_leaf (kernels.traverse.leaf) for the upper level; bottom: the traversal of the placed structures."""
-    observe = make_observer(units, 0)
+    observe, sees = make_observer(units, 0), make_sees(units.lists, struct)
 
     @wp.func
     def visit(accel: struct, surfaces: Any, ray: Ray, index: int, best: Hit) -> Hit:
         """Return the closer of `best` and the hit in placement `index`; at equal t, the hit with the lower prim_id.
         With Units.lists, `surfaces` is HitLists, which receives the hits; the result is a miss."""
+        if wp.static(units.filtered):
+            if not sees(accel, surfaces, ray, index):
+                return best
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
         if wp.static(units.observer != ""):

@@ -82,6 +82,14 @@ WRT_CALLED int store_roots(const int* worlds, int stride, const int* roots, int 
     return together ? active : rays;
 }
 
+// Return the rays of `mask` that see an instance (Units.filtered). filters: `exclude` of each ray of a packet, then `mask` of each.
+WRT_CALLED int rays_seeing(const int* filters, int body, int groups, int mask) {
+    int out = 0;
+    for (int j = 0; j < LANES; ++j)
+        out |= ((filters[j] == -1 || filters[j] != body) && (filters[LANES + j] & groups) != 0) << j;
+    return out & mask;
+}
+
 // --- the space of a placed structure ------------------------------------------------------------------------------------------
 
 // Return powers of two.

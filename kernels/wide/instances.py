@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.headers import with_headers
-from wrt.kernels.query import HitArrays, RayArrays, WorldRays
+from wrt.kernels.query import FilteredRays, HitArrays, RayArrays, WorldRays
 from wrt.kernels.rows import put_int
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
@@ -64,6 +64,8 @@ else:
 # The first packets of Scratch are in the spaces of placements: of a packet that walks, and of the ray in each slot. Scratch has two stacks
 # and two slots for each interleaved ray. The second, at an index higher by SLOTS, is for the upper level. Packets use its stacks, too.
 PLACED = (SLOTS + LANES - 1) // LANES
+FILTERS = (PLACED + PACKETS) * PACKET_SIZE  # Index in Scratch.packets, behind the packets, of each packet's structs.Filter: rays_seeing.
+FILTERS_SIZE = 2 * LANES * PACKETS
 TOP_STACK = STACK_WORDS * SLOTS // ENTRY  # First entry of a packet's stack in the upper level.
 FEW_PLACED = 3  # If at most so many rays of a packet enter a placement, they are interleaved.
 
@@ -141,12 +143,34 @@ def fill_slot(scratch: Scratch, slot: int, ray: int, next: int, placement: int) 
     """Put a ray with an empty stack into a slot."""
 
 
-@wp.func_native("""
-    return wrt::store_roots(rays.world.data + (rays.world.strides[0] == 0 ? 0 : first), rays.world.strides[0] != 0, accel.roots.data,
-                            accel.roots.shape[0], count, active, scratch.packets.data + base);
+def make_store_roots(rays_struct: Any) -> Any:
+    @wp.func_native("""
+        return wrt::store_roots(rays.world.data + (rays.world.strides[0] == 0 ? 0 : first), rays.world.strides[0] != 0, accel.roots.data,
+                                accel.roots.shape[0], count, active, scratch.packets.data + base);
+    """)
+    def store_roots(accel: Instances, rays: rays_struct, first: int, count: int, active: int, scratch: Scratch, base: int) -> int:
+        """Store the root of each ray's world. Return the mask `active` (see set_up) as instances.h describes."""
+
+    return store_roots
+
+
+@wp.func_native(f"""
+    int* const to = (int*)scratch.packets.data + {FILTERS} + {2 * LANES} * packet;
+    for (int j = 0; j < count; ++j) {{
+        to[j] = rays.exclude.data[rays.exclude.strides[0] == 0 ? 0 : first + j];
+        to[{LANES} + j] = rays.mask.data[rays.mask.strides[0] == 0 ? 0 : first + j];
+    }}
 """)
-def store_roots(accel: Instances, rays: WorldRays, first: int, count: int, active: int, scratch: Scratch, base: int) -> int:
-    """Store the root of each ray's world. Return the mask `active` (see set_up) as instances.h describes."""
+def store_filters(rays: FilteredRays, first: int, count: int, scratch: Scratch, packet: int) -> None: ...
+
+
+@wp.func_native(f"""
+    const int id = accel.ids.data[placement];
+    return wrt::rays_seeing((const int*)scratch.packets.data + {FILTERS} + {2 * LANES} * packet, accel.bodies.data[id],
+                            accel.masks.data[id], mask);
+""")
+def rays_seeing(accel: Instances, placement: int, scratch: Scratch, packet: int, mask: int) -> int:
+    """Return the rays of the mask, of packet PLACED + `packet`, that see a placement."""
 
 
 def make_top_walk(units: Units, any_hit: bool) -> Any:
@@ -158,6 +182,10 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
     @wp.func
     def visit(accel: Instances, surfaces: Surfaces, placement: int, mask: int, scratch: Scratch, base: int):
         """Trace the rays of the mask through a placement's structure."""
+        if wp.static(units.filtered):
+            mask = rays_seeing(accel, placement, scratch, base / PACKET_SIZE - PLACED, mask)
+            if mask == 0:
+                return
         bottom = accel.bottoms[accel.placements[placement].bottom]
         active = place_packet(accel, placement, scratch, base, mask)
         result = int(STOPPED)
@@ -192,16 +220,30 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
     return walk
 
 
-def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
+def make_start(any_hit: bool, place_ray: Any, worlds: bool, filtered: bool) -> Any:
     """Return descend and start, which bring a slot's ray to its next placement. Both return False after the last placement."""
-    top_begin, top_step = make_top_steps(any_hit)[2:4]
+    top_begin, top_step, top_pop = make_top_steps(any_hit)[2:]
+
+    @wp.func
+    def next_seen(accel: Instances, scratch: Scratch, slot: int, next: int) -> int:
+        """Return `next`, or, if it is a placement that the ray does not see, what the ray visits next in the upper level."""
+        column = slot_at(scratch.slots, SLOT_SIZE * (SLOTS + slot) + wp.static(SLOT["ray"]))
+        while next < 0:
+            if rays_seeing(accel, leaf_first(next), scratch, column / PACKET_SIZE - PLACED, 1 << column % PACKET_SIZE) != 0:
+                break
+            next = top_pop(accel, scratch, SLOTS + slot, number(scratch.packets, column + wp.static(FIELD["t"])))
+        return next
 
     @wp.func
     def descend(accel: Instances, scratch: Scratch, slot: int, next: int) -> bool:
         """Walk the upper level to the ray's next placement, and change to its space."""
         top = SLOT_SIZE * (SLOTS + slot)
+        if wp.static(filtered):
+            next = next_seen(accel, scratch, slot, next)
         while next > 0:
             next = top_step(accel, scratch, SLOTS + slot)
+            if wp.static(filtered):
+                next = next_seen(accel, scratch, slot, next)
         if next == EMPTY:
             return False
         local = slot / LANES * PACKET_SIZE + slot % LANES
@@ -253,7 +295,7 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
 
     The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane, of the packets behind the first PLACED ones."""
     place_ray, take_hit = make_changes(any_hit, far_pad(units.box))[2:]
-    descend, start = make_start(any_hit, place_ray, worlds)
+    descend, start = make_start(any_hit, place_ray, worlds, units.filtered)
     turn = make_turn(units, any_hit, take_hit, descend)
 
     @wp.func
@@ -279,9 +321,10 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
 @cache
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> Any:
     """Return the kernel of batch.make_kernel for instances."""
-    worlds = rays_struct is WorldRays
+    worlds = rays_struct in (WorldRays, FilteredRays)
     walk, interleaved = make_top_walk(units, any_hit), make_top_interleaved(units, any_hit, worlds)
-    set_up, rays_meeting = make_set_up(rays_struct), make_top_steps(any_hit).rays_meeting
+    set_up, store_roots = make_set_up(rays_struct), make_store_roots(rays_struct)
+    rays_meeting = make_top_steps(any_hit).rays_meeting
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
@@ -299,6 +342,8 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> An
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), False, scratch, base)
                 if wp.static(worlds):
                     active = store_roots(accel, rays, block + LANES * p, count, active, scratch, base)
+                if wp.static(units.filtered):
+                    store_filters(rays, block + LANES * p, count, scratch, p)
                 store_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
                     put_int(scratch.report, ANY_REFUSED, 1)

@@ -6,7 +6,7 @@ from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide import batch, instances
 from wrt.kernels.wide.batch import PACKETS, SLOTS
-from wrt.kernels.wide.layout import LANES, PACKET_SIZE, SLOT_SIZE, STACK_WORDS, WIDTH
+from wrt.kernels.wide.layout import LANES, SLOT_SIZE, STACK_WORDS, WIDTH
 from wrt.kernels.wide.nodes import ROW_PADS
 from wrt.kernels.wide.packets import REPORT_SIZE
 from wrt.kernels.wide.traverse import WideTraversal
@@ -17,7 +17,7 @@ class BatchTraversal(WideTraversal):
 
     stream_block = PACKETS * LANES
     # Lengths of the arrays in Scratch. Instances need twice the stacks and slots, and packets in the spaces of placements.
-    stream_sizes = (instances.PLACED + PACKETS) * PACKET_SIZE, 2 * STACK_WORDS * SLOTS, 2 * SLOT_SIZE * SLOTS, REPORT_SIZE
+    stream_sizes = instances.FILTERS + instances.FILTERS_SIZE, 2 * STACK_WORDS * SLOTS, 2 * SLOT_SIZE * SLOTS, REPORT_SIZE
 
     def __init__(self) -> None:
         super().__init__(WIDTH)

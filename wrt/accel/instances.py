@@ -22,7 +22,7 @@ from wrt.core.building import build_clock
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.settings import DEFAULT_DEVICE
-from wrt.core.types import ArrayLike, WarpArray, WarpStruct
+from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.scene.values import as_number, shift
@@ -30,7 +30,44 @@ from wrt.scene.values import as_number, shift
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
-class Instances(Accelerator):
+class InstanceArrays(Accelerator):
+    """What the caller's kernels read of a structure over instances, and what the caller writes."""
+
+    @property
+    def world(self) -> WarpStruct:
+        """The structure, as of the last move, as an argument of the user's kernels (`wrt.ray_query`)."""
+        return kernel_argument(self._snapshot)
+
+    @property
+    def bodies(self) -> WarpArray:
+        """By the value of `hits.instance`, the number that `exclude` means: a Warp array of int32 on the device, which the caller may
+        write. At first the index of the object in its world; instances with one number are one body. Below 0, no ray excludes it."""
+        return self._filters()[0]
+
+    @property
+    def masks(self) -> WarpArray:
+        """By the value of `hits.instance`, 32 bits, of which the argument `mask` of a ray must have one: a Warp array of int32 on the
+        device, which the caller may write. At first all bits."""
+        return self._filters()[1]
+
+    def _filters(self) -> tuple[WarpArray, WarpArray]:
+        data = self._snapshot.data
+        if self._snapshot.bodies is None:
+            raise InputError("has no masks and bodies: some objects are no instances", argument="accel",
+                             hint="wrt.build(scene, movable=True) makes each object an instance")
+        return data.bodies, data.masks
+
+
+def filters_of(geometry: InstancedGeometry, device: Device, given: Any = None) -> tuple[WarpArray | None, WarpArray | None]:
+    """Return the arrays `bodies` and `masks` with their first values, or with those given; None if an object is not an instance."""
+    if not geometry.is_placed.all() or len(geometry.spheres):  # hits.instance is not the row of the geometry
+        return None, None
+    first, n = geometry.first_instance, len(geometry.part)
+    bodies, masks = (np.arange(n) - np.repeat(first[:-1], np.diff(first)), np.full(n, -1)) if given is None else given
+    return upload(bodies, wp.int32, device), upload(masks, wp.int32, device)
+
+
+class Instances(InstanceArrays):
     """A binary BVH over instances of meshes, made by `wrt.build`. Each mesh has one structure; all structures are of one class.
 
     The closest hit does not depend on the tree: it is the closest of the hits that the meshes' structures find in their own spaces.
@@ -47,15 +84,15 @@ class Instances(Accelerator):
 
     @classmethod
     def restore(cls, bottoms: list[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None, device: str,
-                threads: int | None) -> Self:
-        """Make the structure over the structures of all parts of the geometry. The upper level is built."""
+                threads: int | None, filters: Any = None) -> Self:
+        """Make the structure over the structures of all parts of the geometry. The upper level is built. filters: see `_place`."""
         self, begin, units = cls.__new__(cls), build_clock(), bottoms[0].structure.units
         Accelerator.__init__(self, Structure(type(bottoms[0]), units._replace(instances=True)), geometry, attributes, device, threads)
-        self._place(bottoms, geometry, begin)
+        self._place(bottoms, geometry, begin, filters)
         return self
 
-    def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float) -> None:
-        """Build the upper level, and set the snapshot."""
+    def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float, filters: Any = None) -> None:
+        """Build the upper level, and set the snapshot. filters: values of `bodies` and `masks`; None for those at first."""
         self.bottoms = bottoms
         # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
         self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
@@ -64,18 +101,16 @@ class Instances(Accelerator):
         boxes = part_boxes(geometry, self.bottoms, max(BOXES // max(len(geometry.part), 1), 8))
         self._top = build_top(geometry, boxes, self.device, self.threads, wide)
         self._roots = upload(self._top.roots, wp.int32, self.device)
+        self._bodies, self._masks = filters_of(geometry, self.device, filters)
         self._install_top(geometry, begin, self._top.cost)
-
-    @property
-    def world(self) -> WarpStruct:
-        """The structure, as of the last move, as an argument of the user's kernels (`wrt.ray_query`)."""
-        return kernel_argument(self._snapshot)
 
     def _install_top(self, geometry: InstancedGeometry, begin: float, built_cost: float, changes: bool = False) -> None:
         """Set the snapshot over the upper level. begin, built_cost: see OneMesh._install; changes: see Snapshot."""
         top, data = self._top, self.structure.struct()
         nodes = data.nodes = top.data.nodes
         data.placements, data.slack, data.bottoms = top.data.placements, top.data.node_slack, self._bottoms
+        if self._bodies is not None:
+            data.bodies, data.masks, data.ids = self._bodies, self._masks, upload(top.order, wp.int32, self.device)
         if top.data.wide is not None:
             data.wide, data.roots = top.data.wide, to_warp(np.arange(len(top.roots), dtype=np.int32))
         stats = [each.stats for each in self._bottom_snapshots]
@@ -86,7 +121,7 @@ class Instances(Accelerator):
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
         self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots,
-                                 order=top.order, changes=changes)
+                                 order=top.order, bodies=self._bodies, changes=changes)
 
     @property
     def invalid_moves(self) -> WarpArray:
@@ -222,7 +257,9 @@ class Instances(Accelerator):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""
-        return Instances.restore, (self.bottoms, cast(Any, self.geometry).now(), self._snapshot.attributes, str(self.device), self.threads)
+        filters = None if self._bodies is None else [each.numpy() for each in self._filters()]
+        return Instances.restore, (self.bottoms, cast(Any, self.geometry).now(), self._snapshot.attributes, str(self.device), self.threads,
+                                   filters)
 
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry

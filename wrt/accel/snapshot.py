@@ -49,6 +49,11 @@ class Structure(NamedTuple):
         """Warp struct of a structure over one mesh: this structure, or, with instances, a structure of the lower level."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
+    @property
+    def filtered(self) -> "Structure":
+        """The structure for rays that do not see all instances (Units.filtered)."""
+        return self._replace(units=self.units._replace(filtered=True))
+
     def require_one_mesh(self, message: str) -> None:
         """Raise InputError with `message` if the structure has instances or spheres."""
         if self.units.instances or self.units.spheres:
@@ -103,7 +108,7 @@ def any_hit_kernel(structure: Structure) -> Kernel:
 
 @made_once
 def worlds_kernel(structure: Structure, any_hit: bool) -> Kernel:
-    return make_worlds_kernel(structure.struct, structure.traversal(any_hit=any_hit), any_hit)
+    return make_worlds_kernel(structure.struct, structure.traversal(any_hit=any_hit), any_hit, structure.units.filtered)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +203,7 @@ class Snapshot:
     built_cost: float = float("nan")  # SAH cost at the last build.
     roots: WarpArray | None = None  # For instances, (W,) index of each world's root node.
     order: np.ndarray | None = None  # For instances, (I,) row of geometry.to_world of each placement.
+    bodies: WarpArray | None = None  # For instances: see Instances.bodies; None if an object is not an instance.
     followed: WarpArray | None = None  # Vertices of the last refit, if they require gradients.
     changes: bool = False  # True if refits in place modify the arrays.
 

@@ -131,7 +131,7 @@ def test_rays_of_several_worlds(together):
     accel = wrt.build([scene(5, 0), icosphere(1), scene(1, 3), scene(20, 4)], threads=1)
     o, d, t_min, t_max = mixed_rays(4000, 9)
     ids = wp.array(np.random.default_rng(0).integers(-1, 6, 4000).repeat(together)[:4000].astype(np.int32), device="cpu")
-    rays, worlds = rays_of(o, d, t_min, np.maximum(t_max, t_min))[0], check_world(accel.snapshot, ids, (4000,))
+    rays, worlds = rays_of(o, d, t_min, np.maximum(t_max, t_min))[0], check_world(accel.snapshot, (4000,), ids)
     for types, query in ((HIT_TYPES, accel.closest_hit), (ANY_HIT_TYPES, accel.any_hit)):
         assert world_tracer(accel.structure, types is ANY_HIT_TYPES).stream is not None
         expected = answer_arrays(types, None, (4000,), None)

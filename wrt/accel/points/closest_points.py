@@ -100,7 +100,7 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     origin = snapshot.geometry.origin
     rows, shape = points_of(points, origin)
-    worlds = check_world(snapshot, world, shape)
+    worlds = check_world(snapshot, shape, world)
     roots = roots_at(snapshot, worlds, len(rows))
     kernel, surfaces = rows_kernel(kernels.layout, roots is not None), point_surfaces(snapshot)
     given = rows, np.zeros(len(rows), np.int32) if roots is None else roots

@@ -76,7 +76,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces",
                          hint="for an open mesh, use wrt.winding_number(accel, points) > 0.5, or wrt.signed_distance(..., sign='winding')")
-    inside = in_shape(odd_crossings(query, rows, worlds=check_world(query.snapshot, world, shape)), shape)
+    inside = in_shape(odd_crossings(query, rows, worlds=check_world(query.snapshot, shape, world)), shape)
     return inside if isinstance(points, wp.array) else given_like(points, inside)
 
 

@@ -78,7 +78,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     accel, threads = enclosing(accel), thread_count(threads)
     snapshot = accel.snapshot
     rows, shape = points_of(points, snapshot.geometry.origin)
-    worlds = check_world(snapshot, world, shape)
+    worlds = check_world(snapshot, shape, world)
     if isinstance(snapshot.geometry, InstancedGeometry):
         out = np.zeros(len(rows))
         ids = np.zeros(len(rows), np.int32) if worlds is None else worlds.arrays.id.numpy()

@@ -28,10 +28,17 @@ from wrt.core.warp_private import recording_tape, refuse_capture
 from wrt.kernels.structs import Surfaces
 
 
-class RayOptions(TypedDict, total=False):
-    """Options of `any_hit` by keyword."""
+class Seen(TypedDict, total=False):
+    """Arguments by keyword that say what each ray sees: see `Accelerator.closest_hit`."""
 
     world: ArrayLike | None
+    exclude: ArrayLike | None
+    mask: ArrayLike | None
+
+
+class RayOptions(Seen, total=False):
+    """Options of `any_hit` by keyword."""
+
     invalid: str
 
 
@@ -136,8 +143,12 @@ class Accelerator:
         out : Hits, optional
             Hits of the rays' shape whose arrays receive the results. No two arrays of results and rays may overlap.
         world : int or array_like of int of the rays' shape, optional
-            Index of the world that each ray sees; required over several worlds. Warp arrays are not checked: in a world that does
-            not exist, a ray misses.
+            Index of the world that each ray sees. Over W worlds, rays of shape (W, ...) need none: ray [w, ...] sees world w. Warp
+            arrays are not checked: in a world that does not exist, a ray misses.
+        exclude : int or array_like of int of the rays' shape, optional
+            Body whose instances the ray passes through, a value of `Instances.bodies`; -1 for none. Warp arrays must be int32.
+        mask : int or array_like of int of the rays' shape, optional
+            32 bits. The ray sees an instance only if both masks have a common bit: `mask & Instances.masks[hits.instance] != 0`.
         invalid : {"raise", "miss"}
             "miss": a ray with NaN, another value that is not valid, or direction 0 misses. This reads Warp arrays on the host.
         counters, trace : bool
@@ -181,7 +192,7 @@ class Accelerator:
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads, world, invalid
+        origins, directions, t_min, t_max, threads, world, exclude, mask, invalid
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
@@ -200,21 +211,24 @@ class Accelerator:
 
 
 def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, Any, Any, Any], threads: int | None,
-           out: Sequence[Any] | None, world: ArrayLike | None = None,
-           invalid: str = "raise") -> tuple[Query, Shape | None, Callable[[Any], Any] | None]:
+           out: Sequence[Any] | None, invalid: str = "raise",
+           **seen: Unpack[Seen]) -> tuple[Query, Shape | None, Callable[[Any], Any] | None]:
     """Return the query of a call, the shape of its results, and the function that converts them to the caller's library.
 
     Shape and function are None in the usual call: NumPy arrays (N, 3), or Warp arrays (N,). types: of the results, of which only hits have
-    gradients; `rays`: the caller's origins, directions, t_min and t_max; other arguments: see `Accelerator.closest_hit`.
+    gradients; `rays`: the caller's origins, directions, t_min and t_max; seen: world, exclude and mask; other arguments: see
+    `Accelerator.closest_hit`.
     """
     if threads is not None:
         threads = thread_count(threads)
     valid, shape = rays_of(*rays, types is HIT_TYPES, snapshot.geometry.origin, invalid)
     if not valid.as_warp:
         refuse_capture()
-    form, give, width = ((len(valid.origins),), None, 0) if shape is None else (shape, to_tensor_like(*rays[:2]), tiled_width(shape))
+    form, give = ((len(valid.origins),), None) if shape is None else (shape, to_tensor_like(*rays[:2]))
     arrays = answer_arrays(types, out, form, snapshot.device if valid.as_warp else None, give is not None)
-    return Query(valid, arrays, threads, check_world(snapshot, world, form), width), shape, give
+    worlds = check_world(snapshot, form, **seen)
+    width = 0 if worlds is not None and form[:-1] == (len(worlds.first_prim),) else tiled_width(form)  # a tile has rays of one world
+    return Query(valid, arrays, threads, worlds, width), shape, give
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.geometry import InstancedGeometry
-from wrt.accel.queries.accelerator import Accelerator, snapshot_of
+from wrt.accel.queries.accelerator import Accelerator, Seen, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.arguments import Shape, WorldIds, check_world, rays_of, roots_at
 from wrt.accel.queries.hit_points import HitIds, Source, device_scene, part_faces
@@ -78,13 +78,14 @@ class ListQuery:
     shape: Shape | None = None  # Of the rays; None: (n,).
     rays: Rays
     worlds: WorldIds | None = None
-    roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances.
+    roots: np.ndarray | None = None  # (1 or 3, N) int32: root node of each ray's world, or -1; exclude, mask. None without instances.
     touches: np.ndarray  # (N,) bool, if crossings are found: the ray hits triangles, but crosses none.
     give: Any = staticmethod(to_numpy)  # Converts arrays to those of the caller's library.
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel, instances=True)
         self.threads, self.device = thread_count(threads), self.snapshot.device
+        self.structure = self.snapshot.structure
         self.crossings = as_one(crossings, bool, "crossings")
         self.mesh: Mesh = None, None, None
         if self.snapshot.roots is not None:
@@ -96,16 +97,21 @@ class ListQuery:
     def of_valid(self, rays: Rays, worlds: WorldIds | None) -> ListQuery:
         """Set rays that are valid: contiguous NumPy arrays of float32."""
         self.n, self.rays, self.worlds = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays), worlds
-        self.roots = roots_at(self.snapshot, worlds, self.n)
+        roots = roots_at(self.snapshot, worlds, self.n)
+        if worlds is not None and worlds.filtered and roots is not None:
+            self.roots = np.stack([roots, worlds.arrays.exclude.numpy(), worlds.arrays.mask.numpy()])
+            self.structure = self.snapshot.structure.filtered
+        else:
+            self.roots = None if roots is None else roots[None]
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-           world: ArrayLike | None = None) -> ListQuery:
+           **seen: Unpack[Seen]) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         rays, self.shape = rays_of(origins, directions, t_min, t_max, origin=self.snapshot.geometry.origin)
         if self.shape is not None:
             self.give = to_tensor_like(origins, directions) or to_numpy
-        worlds = check_world(self.snapshot, world, (len(rays.origins),) if self.shape is None else self.shape)
+        worlds = check_world(self.snapshot, (len(rays.origins),) if self.shape is None else self.shape, **seen)
         return self.of_valid(host_arrays(rays) if self.device.is_cpu else rays, worlds)
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
@@ -170,7 +176,7 @@ class ListQuery:
 
         def find(lists: Any, i: int) -> None:  # HostLists or GpuLists
             some = slice(firsts[i], min(firsts[i] + step, self.n))  # Warp arrays refuse a larger end
-            counts = lists.find(self.snapshot, [array[some] for array in self.rays], None if self.roots is None else self.roots[some],
+            counts = lists.find(self.snapshot, [array[some] for array in self.rays], None if self.roots is None else self.roots[:, some],
                                 min(limit, ALL), self.mesh, counting)
             if self.crossings:
                 self.touches[some] = counts < 0
@@ -180,23 +186,22 @@ class ListQuery:
                 lists.release()
 
         if self.device.is_cpu:
-            free = host_lists(self.snapshot.structure)
+            free = host_lists(self.structure)
             run_all([partial(free.run, partial(find, i=i)) for i in range(len(firsts))], self.threads)
         else:
             for i in range(len(firsts)):
-                find(GpuLists(self.device), i)
+                find(GpuLists(self.device, self.structure), i)
         return out
 
 
 @overload
 def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *, world: ArrayLike | None = ...) -> AllHits: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **seen: Unpack[Seen]) -> AllHits: ...
 @overload
 def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *,
-             world: ArrayLike | None = ...) -> AllHits[TensorT]: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **seen: Unpack[Seen]) -> AllHits[TensorT]: ...
 def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-             threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> AllHits[Any]:
+             threads: int | None = None, crossings: bool = False, **seen: Unpack[Seen]) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
     No ray passes between two adjacent triangles: through their common edge it hits one or both, depending on rounding. The time
@@ -206,7 +211,7 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
     ----------
     accel : Accelerator
         Structure without spheres.
-    origins, directions, t_min, t_max, threads, world
+    origins, directions, t_min, t_max, threads, world, exclude, mask
         See `Accelerator.closest_hit`.
     crossings : bool
         Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
@@ -218,23 +223,23 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
     AllHits
         Arrays of NumPy, or of the library of `origins`: PyTorch, JAX.
     """
-    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world).all()
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, **seen).all()
 
 
 @overload
 def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
-               *, world: ArrayLike | None = ...) -> npt.NDArray[np.int64]: ...
+               **seen: Unpack[Seen]) -> npt.NDArray[np.int64]: ...
 @overload
 def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
-               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., *, world: ArrayLike | None = ...) -> TensorT: ...
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **seen: Unpack[Seen]) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
-               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> object:
+               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, **seen: Unpack[Seen]) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
     ----------
-    accel, origins, directions, t_min, t_max, threads, crossings, world
+    accel, origins, directions, t_min, t_max, threads, crossings, world, exclude, mask
         See `all_hits`.
 
     Returns
@@ -242,7 +247,7 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
     (...) int64
         Array of the rays' shape, of NumPy or of the library of `origins`: PyTorch, JAX.
     """
-    query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world)
+    query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, **seen)
     counts = query.counts()
     return query.converted(counts if query.shape is None else counts.reshape(query.shape))
 
@@ -250,19 +255,19 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
 @overload
 def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ...,
                t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., *, crossings: bool = ...,
-               world: ArrayLike | None = ...) -> Hits: ...
+               **seen: Unpack[Seen]) -> Hits: ...
 @overload
 def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT | None = ...,
                t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., *, crossings: bool = ...,
-               world: ArrayLike | None = ...) -> Hits[TensorT]: ...
+               **seen: Unpack[Seen]) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, *, crossings: bool = False,
-               world: ArrayLike | None = None) -> Hits[Any]:
+               **seen: Unpack[Seen]) -> Hits[Any]:
     """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
     Parameters
     ----------
-    accel, origins, directions, t_min, t_max, threads, crossings, world
+    accel, origins, directions, t_min, t_max, threads, crossings, world, exclude, mask
         See `all_hits`.
     k : int
         Number of hits, at least 1.
@@ -278,4 +283,4 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
         Names the argument and what was expected.
     """
     k = as_integer(k, "k", 1, (1 << 31) - 1)
-    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world).first(k)
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, **seen).first(k)

@@ -1,6 +1,7 @@
 """Arguments of queries: rays and points of any leading shape, broadcast and flattened, and the world that each ray sees."""
 
 from ctypes import c_float
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -13,7 +14,7 @@ from wrt.core.arrays import check_no_gradients, contiguous, float32, from_tensor
 from wrt.core.checks import as_choice, shown
 from wrt.core.device import to_device, upload
 from wrt.core.errors import InputError
-from wrt.core.types import Array, ArrayLike, WarpStruct, WarpType
+from wrt.core.types import Array, ArrayLike, Device, WarpArray, WarpStruct, WarpType
 from wrt.core.warp_private import recording_tape
 from wrt.kernels.query import FARTHEST, Worlds
 
@@ -179,7 +180,7 @@ def indices_of(value: ArrayLike, shape: Shape, name: str, low: int, count: int) 
         raise InputError(f"must be a whole number or {shape} of them, got {shown(value)}", argument=name)
     if array.size and not (array.min() >= low and array.max() < count):
         raise InputError(f"must be {low} to {count - 1}, got {array.min() if array.min() < low else array.max()}", argument=name)
-    return np.broadcast_to(array, (int(np.prod(shape)),)).astype(np.int32)
+    return np.broadcast_to(array, (int(np.prod(shape)),)).astype(np.int32)  # 2^31 and more become negative
 
 
 def _without_invalid(rays: Rays) -> Rays:
@@ -202,6 +203,12 @@ class WorldIds(NamedTuple):
 
     first_prim: np.ndarray
     arrays: WarpStruct  # kernels.query.Worlds, on the structure's device
+    filtered: bool = False  # True if `arrays` has `exclude` and `mask`.
+
+    @property
+    def columns(self) -> list[WarpArray]:
+        """Fields of kernels.query.WorldRays, or FilteredRays, behind the fields of RayArrays."""
+        return [getattr(self.arrays, name) for name in (("id", "exclude", "mask") if self.filtered else ("id",))]
 
     def of(self, rays: np.ndarray) -> "WorldIds":
         """Return the worlds of some of the rays, given by their indices."""
@@ -215,23 +222,52 @@ class WorldIds(NamedTuple):
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 
 
-def check_world(snapshot: Snapshot, world: ArrayLike | None, shape: Shape) -> WorldIds | None:
-    """Check and convert the argument `world` of a query with rays of a shape; None stays None. Raises InputError that names `world`."""
-    geometry = snapshot.geometry
-    if world is None:
-        if over_worlds(geometry) and geometry.n_worlds > 1:
-            raise InputError(f"must not be None: the structure is over {geometry.n_worlds} worlds, because wrt.build makes a world of"
-                             " each entry of a list, and a ray sees one of them", argument="world",
-                             hint="for one scene of these meshes: wrt.build(wrt.Scene.of(meshes))")
-        return None
-    if not over_worlds(geometry):
-        raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
-    ids = indices_of(world, shape, "world", 0, geometry.n_worlds)
-    if isinstance(ids, wp.array):
-        ids = to_device(contiguous(ids), snapshot.device)
+def check_world(snapshot: Snapshot, shape: Shape, world: ArrayLike | None = None, exclude: ArrayLike | None = None,
+                mask: ArrayLike | None = None) -> WorldIds | None:
+    """Check and convert the arguments `world`, `exclude` and `mask` of a query with rays of a shape. Return None for a query that needs
+    none of them. Raises InputError that names the argument."""
+    geometry, device = snapshot.geometry, snapshot.device
+    filters = _filters(snapshot, shape, exclude, mask)
+    count = geometry.n_worlds if over_worlds(geometry) else 1
+    if world is not None:
+        if not over_worlds(geometry):
+            raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
+        ids = _on_device(indices_of(world, shape, "world", 0, count), device)
+    elif count > 1 and shape[:1] != (count,):
+        raise InputError(f"must not be None: the structure is over {count} worlds, because wrt.build makes a world of each entry of a list,"
+                         f" and a ray sees one of them. Without it, the first axis of the rays must be the worlds: ({count}, ...)",
+                         argument="world", hint="for one scene of these meshes: wrt.build(wrt.Scene.of(meshes))")
+    elif count > 1 or filters:
+        ids = _first_axis(str(device), count, int(np.prod(shape)) // count)
     else:
-        ids = upload(ids, wp.int32, snapshot.device)
-    return WorldIds(geometry.world_first_prim, filled(Worlds, (ids, snapshot.roots)))
+        return None
+    assert isinstance(geometry, InstancedGeometry)
+    return WorldIds(geometry.world_first_prim, filled(Worlds, (ids, snapshot.roots, *filters)), bool(filters))
+
+
+def _filters(snapshot: Snapshot, shape: Shape, exclude: ArrayLike | None, mask: ArrayLike | None) -> list[WarpArray]:
+    """Return the arrays `exclude` and `mask` of kernels.query.Worlds; none if both arguments are None."""
+    if exclude is None and mask is None:
+        return []
+    if snapshot.bodies is None:
+        raise InputError("is for structures all of whose objects are instances", argument="mask" if exclude is None else "exclude",
+                         hint="wrt.build(scene, movable=True) makes some")
+    exclude, mask = (-1 if value is None else value for value in (exclude, mask))
+    return [_on_device(indices_of(exclude, shape, "exclude", -1, 1 << 31), snapshot.device),
+            _on_device(indices_of(mask, shape, "mask", -1 << 31, 1 << 32), snapshot.device)]
+
+
+def _on_device(ids: Any, device: Device) -> WarpArray:
+    """Return the result of `indices_of` on a device, without gaps."""
+    if isinstance(ids, wp.array):
+        return to_device(contiguous(ids), device)
+    return upload(ids, wp.int32, device)
+
+
+@lru_cache(4)  # so that a step of a simulation makes it once
+def _first_axis(device: str, count: int, rays: int) -> WarpArray:
+    """Return the world of each ray of a query whose first axis is the world. rays: of each world."""
+    return upload(np.repeat(np.arange(count, dtype=np.int32), rays), wp.int32, wp.get_device(device))
 
 
 def roots_at(snapshot: Snapshot, worlds: WorldIds | None, n: int) -> np.ndarray | None:

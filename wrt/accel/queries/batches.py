@@ -13,12 +13,12 @@ from wrt.accel.queries.raw_launches import SMALL, FewRows, RowKernel, raw_launch
 from wrt.accel.queries.rays import Rays, arrays_on, constant, filled, rays_on
 from wrt.accel.snapshot import Snapshot, Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
+from wrt.core.device import empty_aligned, launch_on, made_once, memory_of, row_type
 from wrt.core.threads import FreeList, run_all, thread_count
 from wrt.core.types import Array, Device, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, captures_on_cpu, record_of, struct_record
 from wrt.kernels.hit_lists import HitLists
-from wrt.kernels.query import HitArrays, RayArrays, WorldRays
+from wrt.kernels.query import FilteredRays, HitArrays, RayArrays, WorldRays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
@@ -79,11 +79,12 @@ def trace_made(snapshot: Snapshot, made: MadeRays, any_hit: bool, threads: int) 
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
     """Trace the rays and write the results to query.out. Raises InputError for invalid rays, after some results are written."""
-    any_hit = len(query.out) == 1
-    if snapshot.device.is_cuda or (query.worlds is not None and not has_stream(snapshot.structure)):
+    any_hit, structure, worlds = len(query.out) == 1, snapshot.structure, query.worlds
+    if snapshot.device.is_cuda or (worlds is not None and not has_stream(structure)):
         trace_one_by_one(snapshot, query)
     else:
-        found = (tracer if query.worlds is None else world_tracer)(snapshot.structure, any_hit)
+        found = (tracer(structure, any_hit) if worlds is None else filter_tracer(structure.filtered, any_hit) if worlds.filtered
+                 else world_tracer(structure, any_hit))
         (found.record if captures_on_cpu() else found.trace)(snapshot, query)
 
 
@@ -101,7 +102,7 @@ def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
 class Tracer:
     """Tracer of queries on the CPU. It holds the kernel for a structure, and workers that later calls reuse.
 
-    rays: RayArrays, or WorldRays if each ray has its own world, which only a structure with a `stream` supports.
+    rays: RayArrays, or, only for a structure with a `stream`, WorldRays if each ray has its own world, or FilteredRays with its filter.
     """
 
     def __init__(self, structure: Structure, any_hit: bool, rays: WarpType = RayArrays) -> None:
@@ -112,6 +113,7 @@ class Tracer:
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
         self.sizes = stream.stream_sizes if self.stream else ()
+        self.kinds = [row_type(field.dtype).base for field in fields_of(self.rays).values()]
         self.types = {} if structure.units.lists else ANY_HIT_TYPES if any_hit else HIT_TYPES
         self.out = HitLists if structure.units.lists else None if any_hit else HitArrays
         self.inputs = structure.struct(), Surfaces(), self.rays(), self.out and self.out()
@@ -130,7 +132,7 @@ class Tracer:
         if rays is not inputs:
             inputs = [np.asarray(array) for array in rays]
         if query.worlds is not None:
-            inputs = [*inputs, query.worlds.arrays.id.numpy()]
+            inputs = [*inputs, *(array.numpy() for array in query.worlds.columns)]
         n = len(inputs[0])
         if n <= SMALL:
             refused = self.workers.run(lambda worker: worker.trace(snapshot, inputs, results))
@@ -143,7 +145,7 @@ class Tracer:
         """Record the trace in the graph that is captured on the CPU: one launch on one thread, with scratch memory of its own.
 
         The graph keeps all arrays alive."""
-        out, n, worlds = query.out, len(query.out[0]), [] if query.worlds is None else [query.worlds.arrays.id]
+        out, n, worlds = query.out, len(query.out[0]), [] if query.worlds is None else query.worlds.columns
         given = filled(self.rays, [*arrays_on(snapshot.device, query.rays), *worlds])
         last = [new_scratch(self.sizes), 0, n] if self.stream else [0]
         launch_on(snapshot.device, self.kernel, min(n, 1) if self.stream else n, snapshot.data, snapshot.surfaces, given,
@@ -153,7 +155,7 @@ class Tracer:
                     width: int) -> bool:
         """Trace in several launches, in place where that is possible. Return whether a ray was refused."""
         n = len(inputs[0])
-        in_place = n <= MOST_PACKED and all(map(readable, inputs))
+        in_place = n <= MOST_PACKED and all(map(readable, inputs, self.kinds))
         width = width if n <= MOST_PACKED and self.stream else 0
         packed = pack(self.rays, inputs, results) if in_place and not width else None
         if packed and self.stream:
@@ -178,7 +180,7 @@ class Tracer:
         return any(refused)
 
 
-tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRays))
+tracer, world_tracer, filter_tracer = (made_once(partial(Tracer, rays=rays)) for rays in (RayArrays, WorldRays, FilteredRays))
 
 
 @made_once
@@ -213,8 +215,7 @@ class Worker:
             return
         self.rays = [np.empty((BUFFERED, 3), np.float32), np.empty((BUFFERED, 3), np.float32), *np.empty((2, BUFFERED), np.float32)]
         self.results = [np.empty(BUFFERED, dtype) for dtype in tracer.types.values()]
-        if tracer.rays is WorldRays:
-            self.rays.append(np.empty(BUFFERED, np.int32))
+        self.rays += [np.empty(BUFFERED, kind) for kind in tracer.kinds[4:]]
         self.packed = pack(tracer.rays, self.rays, self.results)
         self.makers: dict[RowKernel, FewRows] = {}  # which write into self.rays
 
@@ -266,9 +267,9 @@ class Worker:
         return bool(self.report[ANY_REFUSED])
 
 
-def readable(array: np.ndarray) -> bool:
-    """Return whether a kernel can read the array in place."""
-    return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
+def readable(array: np.ndarray, kind: np.dtype) -> bool:
+    """Return whether a kernel can read the array in place as one of `kind`."""
+    return array.dtype == kind and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
 
 
 def pack(kind: WarpType, rays: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> tuple[Any, Any]:
@@ -285,6 +286,7 @@ def trace_one_by_one(snapshot: Snapshot, query: Query) -> None:
     """Trace as trace_query does, a ray per thread: on a GPU, rays in NumPy arrays in parts; each ray in its own world in one launch."""
     device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     if query.worlds is not None:
+        structure = structure.filtered if query.worlds.filtered else structure
         kernel, more = worlds_kernel(structure, len(out) == 1), [query.worlds.arrays]
     else:
         kernel, more = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure), []

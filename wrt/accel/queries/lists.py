@@ -64,9 +64,10 @@ class HostLists:
         self.rays = [np.empty((BATCH, 3), np.float32), np.empty((BATCH, 3), np.float32), *np.empty((2, BATCH), np.float32)]
         self.index = np.arange(BATCH + 1, dtype=np.int32)
         self.room, self.first = FEW, FEW * self.index
-        self.counts, self.root, to_face, self.begin = np.empty((4, BATCH), np.int32)
+        self.counts, to_face, self.begin = np.empty((3, BATCH), np.int32)
+        self.roots = np.empty((3, BATCH), np.int32)
         self.rows, self.out = np.empty(FEW * BATCH, row_type(Hit)), [np.empty(FEW * BATCH, wp.dtype_to_numpy(kind)) for kind in HIT_KINDS]
-        self.place = self.root, np.empty(BATCH, np.float64), to_face, np.empty(BATCH, np.float32)
+        self.place = self.roots[0], np.empty(BATCH, np.float64), to_face, *self.roots[1:], np.empty(BATCH, np.float32)
         self.given, self.packed = struct_record(RayArrays, self.rays), struct_record(HitArrays, self.out)
         # The second lists are for rays with more hits than the first lists hold.
         self.lists, self.more = (struct_record(HitLists, [0, False, None, None, None, self.first, self.counts, self.rows, *self.place])
@@ -81,8 +82,8 @@ class HostLists:
              counting: bool) -> np.ndarray:
         """Fill the lists with at most `limit` hits of each ray. Return HitLists.count, (n,) int32, until the next call.
 
-        roots: (n,) int32, HitLists.root; None without instances. mesh: with vertices and faces to list crossings only. counting: the caller
-        needs only the numbers of hits, and no triangle is in several leaves.
+        roots: (1 or 3, n) int32, HitLists.root, exclude, mask; None without instances. mesh: with vertices and faces to list
+        crossings only. counting: the caller needs only the numbers of hits, and no triangle is in several leaves.
         """
         n = len(rays[0])
         for buffer, array in zip(self.rays, rays, strict=True):
@@ -92,7 +93,7 @@ class HostLists:
         if vertices is not None and faces is not None:
             self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
         if roots is not None and first_face is not None:
-            self.root[:n], self.lists.first_face = roots, record_of(first_face)
+            self.roots[:len(roots), :n], self.lists.first_face = roots, record_of(first_face)
         room = 0 if counting and self.tracer else FEW * BATCH // n
         if self.room != room:
             self.room = room
@@ -163,8 +164,8 @@ def host_lists(structure: Structure) -> FreeList[HostLists]:
 class GpuLists:
     """Lists of a batch of rays on a GPU, in new arrays. Methods as those of HostLists."""
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
+    def __init__(self, device: Device, structure: Structure) -> None:
+        self.device, self.structure = device, structure
 
     def find(self, snapshot: Snapshot, rays: Sequence[WarpArray], roots: np.ndarray | None, limit: int, mesh: Mesh,
              counting: bool) -> np.ndarray:
@@ -190,10 +191,11 @@ class GpuLists:
         lists.first, lists.count = upload(first, wp.int32, self.device), wp.zeros(n, dtype=wp.int32, device=self.device)
         lists.rows = wp.empty(rows_of(first[-1]), dtype=Hit, device=self.device)
         if roots is not None:
-            lists.root = upload(roots, wp.int32, self.device)
+            for name, ids in zip(("root", "exclude", "mask"), roots, strict=False):
+                setattr(lists, name, upload(ids, wp.int32, self.device))
             lists.scale, lists.to_face, lists.end = (wp.empty(n, dtype=kind, device=self.device)
                                                      for kind in (wp.float64, wp.int32, wp.float32))
-        launch_on(self.device, list_hits(snapshot.structure, not counting), n, snapshot.data, self.rays, lists, 0)
+        launch_on(self.device, list_hits(self.structure, not counting), n, snapshot.data, self.rays, lists, 0)
         return lists
 
     def copy(self, begin: np.ndarray, hits: WarpStruct) -> None:

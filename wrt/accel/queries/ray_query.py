@@ -27,7 +27,8 @@ class RayQuery(NamedTuple):
     World : type
         Type of the kernel argument `accel.world`.
     Ray, Hit : type
-        Structs. A Ray has `t_min`, `t_max` and `world`, the index of the world that it sees, at first 0. A Hit has `t`, `u`, `v`
+        Structs. A Ray has `t_min`, `t_max` and `world`, the index of the world that it sees, at first 0; and, for `filtered` functions,
+        `exclude` and `mask`, as in `Accelerator.closest_hit`, which `ray` sets to -1. A Hit has `t`, `u`, `v`
         and `prim_id` (-1 on a miss).
     ray : (origin, direction) -> Ray
         Ray from the origin to infinity.
@@ -48,7 +49,7 @@ class RayQuery(NamedTuple):
     next_hit: DeviceFunction
 
 
-def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
+def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str | None = None, filtered: bool = False) -> RayQuery:
     """Return functions and types with which Warp kernels query structures, on the CPU and on CUDA.
 
     Make the kernel with `@wrt.kernel`. If a kernel is compiled with fused multiply-add, or receives a structure of another kind,
@@ -60,6 +61,8 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
         A structure over meshes, instances or worlds; or a name in `wrt.ACCELERATORS`, for structures of that kind over one mesh.
     triangle, box : str, optional
         Intersection tests of the structures; only if `accel` is a name.
+    filtered : bool
+        Rays pass through instances by `Ray.exclude` and `Ray.mask`; only over instances.
 
     Returns
     -------
@@ -85,6 +88,10 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
     else:
         raise InputError(message, argument="accel")
     require_no_spheres(structure, message)
+    if as_one(filtered, bool, "filtered"):
+        if not structure.units.instances:
+            raise InputError("is for structures over instances", argument="filtered", hint="wrt.build(scene, movable=True) makes one")
+        structure = structure.filtered
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
 
@@ -94,7 +101,8 @@ def query_of(structure: Structure) -> tuple[WarpType, DeviceFunction, DeviceFunc
     """Make the fields World, closest_hit, any_hit and next_hit of RayQuery for a kind of structure."""
     resuming = structure._replace(units=structure.units._replace(resumes=True))
     return make_ray_query(Traversals(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
-                                     resuming.traversal(any_hit=False), structure.units.instances, kind_of(structure)))
+                                     resuming.traversal(any_hit=False), structure.units.instances, structure.units.filtered,
+                                     kind_of(structure)))
 
 
 def require_no_spheres(structure: Structure, message: str) -> None:

@@ -83,7 +83,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     p, q = (_points(value, name, device, snapshot.geometry.origin) for value, name in zip(flat, "ab", strict=True))
     n, as_warp, give = len(p), isinstance(flat[0], wp.array), to_tensor_like(a, b)
     array: Any = answer_arrays(ANY_HIT_TYPES, out if out is None else [out], shape, device if as_warp else None, give is not None)[0]
-    worlds = check_world(snapshot, world, shape)
+    worlds = check_world(snapshot, shape, world)
     ids = [np.zeros(0, np.int32)] * 2
     if has_ids:
         if accel.structure.units.instances:
