@@ -36,6 +36,15 @@ def test_the_lidar_sees_room_and_pillar() -> None:
     assert ((cloud[pillar] > (2.85, 0.85, -1.15)) & (cloud[pillar] < (4.15, 2.15, 3.15))).all()
 
 
+def test_the_height_scan_sees_the_ground_and_not_the_robot() -> None:
+    names = executed("A quadruped's height scan")
+    x, y, _ = np.moveaxis(names["origins"], -1, 0)
+    assert names["scan"].shape == (256, 11, 17)
+    assert np.abs(0.5 - names["scan"] - 0.1 * np.sin(2.0 * x) * np.cos(3.0 * y)).max() < 0.002  # of facets
+    own = names["accel"].closest_hit(names["origins"], (0.0, 0.0, -1.0), world=np.arange(256)[:, None, None])
+    assert (own.t - 0.3 < 0.1).any(axis=(1, 2)).all()  # without `exclude`, each robot sees its trunk
+
+
 def test_each_environment_sees_its_own_ball() -> None:
     names = executed("4,096 environments")
     depth, height = names["depth"], names["matrices"][:, 2, 3]

@@ -121,6 +121,7 @@ class ModelScene:
         first = self.accel.geometry.first_instance, self.accel.geometry.first_prim_in_world
         self._shapes.first_instance, self._shapes.first_prim = (upload(each, wp.int32, self.device) for each in first)
         self.accel.move(self._poses)  # the first move in place makes arrays
+        self.accel.bodies.assign(model.shape_body.numpy()[self.shape])
 
     def _launch(self, kernel: Any, n: int, *inputs: object) -> None:
         launch_on(self.device, kernel, n, *inputs, None, threads=thread_count(None), step=16384, captured=True)

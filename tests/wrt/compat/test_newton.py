@@ -220,6 +220,10 @@ def test_pictures_of_a_sensor_beside_newtons_camera() -> None:
     for name, own in (("depth_image", sensor.range(hits)), ("forward_depth_image", sensor.depth(hits))):
         error = np.abs(theirs[name] - own)[seen]
         assert error.max() < 0.05 and (error < 2e-3).mean() > 0.995
+    body = model.shape_body.numpy()[found.shape]
+    passed = found.accel.closest_hit(sensor.origins, sensor.directions, world=world, exclude=1)  # the capsule of world 0
+    was = hits.hit & (body[hits.instance] == 1)
+    assert was.any() and not (body[passed.instance[passed.hit]] == 1).any() and np.array_equal(hits.t[~was], passed.t[~was])
     normal = hits.shading_normal.reshape(WORLDS, height, width, 3)
     assert (np.linalg.norm(theirs["normal_image"] - normal, axis=3)[seen] < 0.05).mean() > 0.998
 
