@@ -142,7 +142,7 @@ AT_ONCE = {*"""
     DirectionalLight PointLight SpotLight Checkerboard Material Texture Mesh Object Scene Sphere Motion""".split()}
 AT_ONCE |= {f"{kind}.{name}" for kind, names in {
     "OneMesh": "built build_all can_refit data geometry origin restore stats stream tree world",
-    "Instances": "data geometry invalid_moves name origin restore stats world",
+    "Instances": "bodies data geometry invalid_moves masks name origin restore stats world",
     "Hits": "counters each in_shape shape source warp",
     "Sensor": "picture rays",
     "sensors": "LIDARS LidarModel Sensor"}.items() for name in names.split()}
