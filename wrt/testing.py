@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from wrt.lab.hard_cases.bodies import Bodies, bodies
 from wrt.lab.hard_cases.conformance import Case, Report, Result, case_names, hard_cases
 
 if TYPE_CHECKING:
     import pytest
 
-__all__ = ["CASES", "Case", "Report", "Result", "hard_cases"]
+__all__ = ["CASES", "Bodies", "Case", "Report", "Result", "bodies", "hard_cases"]
 
 CASES = tuple(case_names())
 """Names of the cases, each beginning with the letter of its group (docs/testing.md)."""

@@ -119,7 +119,7 @@ class Case:
                 answer = closest_hit(geometry.vertices.copy(), geometry.faces.copy(), part.origins.copy(), part.directions.copy())
             except Exception as error:
                 return Result(self.name, self.rays, raised=error, refused=part.refused)
-            t, prim_id = _checked(answer, len(part))
+            t, prim_id = checked(answer, len(part))
             prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # apply t_max, which closest_hit does not have
             verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)  # type: ignore[arg-type]  # judge t without u and v
         return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
@@ -173,14 +173,15 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
     return Report(tuple(Case(name, rays, seed).result(closest_hit) for name in case_names(cases)))
 
 
-def _checked(answer: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+def checked(answer: Any, n: int, name: str = "closest_hit") -> tuple[np.ndarray, np.ndarray]:
+    """Return t float64 and the index of what was hit int64, (n,) each, of the answer of a function `name`. Raise InputError for others."""
     if hasattr(answer, "prim_id") and hasattr(answer, "t"):
         answer = answer.t, answer.prim_id
     try:
         t, prim_id = (np.asarray(each) for each in answer)
     except (TypeError, ValueError):
-        raise InputError(f"must return t and prim_id, got {type(answer).__name__}", argument="closest_hit") from None
+        raise InputError(f"must return t and prim_id, got {type(answer).__name__}", argument=name) from None
     if t.shape != (n,) or prim_id.shape != (n,) or t.dtype.kind not in "iuf" or prim_id.dtype.kind not in "iu":
         raise InputError(f"must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
-                         f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}", argument="closest_hit")
+                         f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}", argument=name)
     return t.astype(np.float64), prim_id.astype(np.int64)
