@@ -8,9 +8,10 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.query import HitArrays, RayArrays, Worlds, load_hit
 from wrt.kernels.shade.surface import Place, corners_at, instance_at, make_triangle_at, sphere_uv, triangle_point, triangle_uv
-from wrt.kernels.structs import Instance, Surfaces, kernel
+from wrt.kernels.structs import Hit, Instance, Surfaces, kernel
+from wrt.kernels.transforms import inverted
 
 U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoff of float32.
 U64 = wp.constant(wp.float64(2.0**-53))  # Unit roundoff of float64.
@@ -38,7 +39,9 @@ class ObjectIds:
     """The tables from primitives to the ids of objects and instances that users know."""
 
     first_prim: wp.array(dtype=wp.int32)  # First prim_id of each object or instance, then of each sphere.
-    instance: wp.array(dtype=wp.int32)  # The user's id of each entry of Surfaces.instances.
+    instance: wp.array(dtype=wp.int32)  # The user's id of each entry of Surfaces.instances; empty if it is the object's index.
+    world_prim: wp.array(dtype=wp.int32)  # Over worlds: index of each world's first primitive among those of all worlds.
+    world_object: wp.array(dtype=wp.int32)  # The same of objects.
 
 
 @wp.struct
@@ -255,14 +258,17 @@ def write_miss(out: HitPlaces, i: int):
 
 
 @wp.func
-def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: int, out: HitPlaces, i: int):
-    if out.face.shape[0] > 0:
-        first = object_ids.first_prim[last_entry(object_ids.first_prim, prim_id)]
-        out.face[i] = wp.where(prim_id < surfaces.n_triangles, prim_id - first, -1)
-    if out.object.shape[0] > 0:
-        out.object[i] = last_entry(object_ids.first_prim, prim_id)
-    if out.instance.shape[0] > 0:
-        out.instance[i] = object_ids.instance[place.instance]
+def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, world: int, prim_id: int, out: HitPlaces, i: int):
+    if out.face.shape[0] + out.object.shape[0] + out.instance.shape[0] > 0:
+        index = last_entry(object_ids.first_prim, prim_id)
+        write(out.face, i, wp.where(prim_id < surfaces.n_triangles, prim_id - object_ids.first_prim[index], -1))
+        if out.instance.shape[0] > 0:
+            out.instance[i] = index
+            if object_ids.instance.shape[0] > 0:
+                out.instance[i] = object_ids.instance[place.instance]
+        if object_ids.world_object.shape[0] > 0:
+            index = index - object_ids.world_object[world]
+        write(out.object, i, index)
     write(out.material, i, place.material)
 
 
@@ -273,23 +279,39 @@ def write_point(at: PlanePoint, out: HitPlaces, i: int):
     write(out.error, i, wp.vec3(SAFETY * (at.error + U32 * wp.abs(at.point)) + least))
 
 
-@kernel
-def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
-    """Write the results of the hits first .. first + dim - 1, for the launch size dim. An invalid prim_id is a miss."""
-    i = first + wp.tid()
-    prim_id = hits.prim_id[i]
+@wp.func
+def ids_of(out: HitPlaces) -> int:
+    """Return the sum of the lengths of the arrays of ids."""
+    return out.face.shape[0] + out.object.shape[0] + out.instance.shape[0] + out.material.shape[0]
+
+
+@wp.func
+def points_of(out: HitPlaces) -> int:
+    """Return the sum of the lengths of the other arrays, which need the rays."""
+    return out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0]
+
+
+@wp.func
+def write_places(surfaces: Surfaces, object_ids: ObjectIds, world: int, start: wp.vec3, way: wp.vec3, hit: Hit, out: HitPlaces, i: int):
+    """Write the results of a hit of the ray from `start` in the direction `way`. hit.prim_id counts within its world."""
+    points = points_of(out)
+    if ids_of(out) + points == 0:
+        return
+    prim_id = hit.prim_id
+    if prim_id >= 0 and object_ids.world_prim.shape[0] > 0:
+        prim_id += object_ids.world_prim[world]
     count = surfaces.n_triangles + surfaces.spheres.shape[0]
     if prim_id < 0 or prim_id >= count:
         write_miss(out, i)
         return
     place = place_of(surfaces, prim_id)
-    write_ids(surfaces, object_ids, place, prim_id, out, i)
-    if out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0] == 0:
+    write_ids(surfaces, object_ids, place, world, prim_id, out, i)
+    if points == 0:
         return
-    origin = wp.vec3d(rays.origin[i])
-    direction = wp.vec3d(rays.direction[i])
+    origin = wp.vec3d(start)
+    direction = wp.vec3d(way)
     if prim_id >= surfaces.n_triangles:
-        on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hits.t[i], origin, direction)
+        on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hit.t, origin, direction)
         write_point(on_ball, out, i)
         normal = wp.vec3(wp.normalize(on_ball.normal))
         write(out.normal, i, normal)
@@ -297,11 +319,48 @@ def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits:
         if out.uv.shape[0] > 0:
             out.uv[i] = sphere_uv(normal)
     else:
-        at = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
+        at = on_triangle(surfaces, place, hit.u, hit.v, origin, direction)
         write_point(at, out, i)
         normal = wp.vec3(wp.normalize(at.normal / longest(at.normal)))
         write(out.normal, i, normal)
         if out.shading.shape[0] > 0:
-            out.shading[i] = shading_normal(surfaces, place, hits.u[i], hits.v[i], normal)
+            out.shading[i] = shading_normal(surfaces, place, hit.u, hit.v, normal)
         if out.uv.shape[0] > 0:
-            out.uv[i] = triangle_uv(surfaces, place.face, hits.u[i], hits.v[i])
+            out.uv[i] = triangle_uv(surfaces, place.face, hit.u, hit.v)
+
+
+@kernel
+def place_instances(rows: wp.array(dtype=wp.int32), places: wp.array(dtype=wp.vec4d), instances: wp.array(dtype=Instance)):
+    """Write the matrix of each instance, the three rows of `places` from 3 * rows[i] on; -1: its matrix stays."""
+    i = wp.tid()
+    if rows[i] < 0:
+        return
+    x, y, z = places[3 * rows[i]], places[3 * rows[i] + 1], places[3 * rows[i] + 2]
+    linear = wp.matrix_from_rows(wp.vec3d(x[0], x[1], x[2]), wp.vec3d(y[0], y[1], y[2]), wp.vec3d(z[0], z[1], z[2]))
+    inverse = inverted(linear)
+    size = wp.max(wp.max(longest(inverse[0]), longest(inverse[1])), longest(inverse[2]))  # squares of normals must not overflow
+    instances[i].world_x = x
+    instances[i].world_y = y
+    instances[i].world_z = z
+    instances[i].normal_x = wp.vec3(inverse[0] / size)
+    instances[i].normal_y = wp.vec3(inverse[1] / size)
+    instances[i].normal_z = wp.vec3(inverse[2] / size)
+    instances[i].handedness = wp.where(wp.determinant(linear) < wp.float64(0.0), -1.0, 1.0)
+
+
+@kernel
+def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, worlds: Worlds, hits: HitArrays, out: HitPlaces, first: int):
+    """Write the results of the hits first .. first + dim - 1, for the launch size dim. An invalid prim_id is a miss."""
+    i = first + wp.tid()
+    hit = Hit()
+    hit.prim_id = hits.prim_id[i]
+    origin = wp.vec3()
+    direction = wp.vec3()
+    if rays.origin.shape[0] > 0:
+        origin = rays.origin[i]
+        direction = rays.direction[i]
+        hit = load_hit(hits, i)
+    world = int(0)
+    if worlds.id.shape[0] > 0:
+        world = worlds.id[i]
+    write_places(surfaces, object_ids, world, origin, direction, hit, out, i)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import prod
 from pathlib import PurePath
 from typing import TypeAlias, TypeGuard
 
@@ -13,10 +12,11 @@ import warp as wp
 
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import InstancedGeometry
-from wrt.accel.top_level import TopLevel, transforms_of
+from wrt.accel.queries.transforms import require_on, transforms_in, transforms_of
+from wrt.accel.top_level import TopLevel
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown, unknown
-from wrt.core.device import row_type, upload
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
 from wrt.scene.values import FAR, FAR_IN_A_SCENE, MAX_REACH, SMALLEST, far_origin, shift, warn_if_alone
@@ -113,22 +113,11 @@ def refuse_invalid(ids: np.ndarray, invalid: np.ndarray) -> None:
 
 
 def checked_transforms(ids: WarpArray, matrices: WarpArray, device: Device) -> WarpStruct:
-    """Return kernels.build.moves.Transforms of the arguments of a move in place; values are not checked."""
-    for name, array in (("instance", ids), ("matrix", matrices)):
-        if array.device != device:
-            raise InputError(f"must be on {device}, as the structure is, not on {array.device}", argument=name)
-        if not array.is_contiguous:
-            raise InputError("must be contiguous", argument=name, hint=f"pass {name}.contiguous()")
+    """Return kernels.transforms.Transforms of the arguments of a move in place; values are not checked."""
+    require_on(device, instance=ids, matrix=matrices)
     if ids.dtype != wp.int32 or ids.ndim != 1:
         raise InputError(f"must be a Warp array (R,) of int32, got {shown(ids)}", argument="instance")
-    kind, n = row_type(matrices.dtype), len(ids)
-    shape, kinds = (*matrices.shape, *kind.shape), {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
-    if kind.base not in kinds or shape not in ((n, 7), (n, 3, 4), (n, 4, 4)):
-        raise InputError(f"must be a Warp array ({n},) of transformf or mat44f, or ({n}, 3 or 4, 4) of float32 or float64, got"
-                         f" {shown(matrices)}", argument="matrix")
-    size = prod(shape[1:])
-    numbers = wp.array(ptr=matrices.ptr, dtype=kinds[kind.base], shape=n * size, device=device)  # the caller owns the memory
-    return transforms_of(numbers, size, device, outside=True)
+    return transforms_in(matrices, "matrix", str(len(ids)), lambda shape: shape == ids.shape, outside=True)[0]
 
 
 class InstanceNames:

@@ -225,17 +225,23 @@ class Snapshot:
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 
-def once(make: Callable[Concatenate[Snapshot, P], T]) -> Callable[Concatenate[Snapshot, P], T]:
-    """Cache the results of a function of a snapshot, except for snapshots that refits in place modify.
-
-    The function's other arguments, such as `threads`, must not change its result.
-    """
+def once_for_all(make: Callable[Concatenate[Snapshot, P], T]) -> Callable[Concatenate[Snapshot, P], T]:
+    """Cache the results of a function of a snapshot, which refits in place must not change, nor other arguments, such as `threads`."""
     cache: WeakKeyDictionary[Snapshot, T] = WeakKeyDictionary()
 
     def cached(snapshot: Snapshot, /, *arguments: P.args, **named: P.kwargs) -> T:
         if snapshot in cache:
             return cache[snapshot]
-        value = make(snapshot, *arguments, **named)
-        return value if snapshot.changes else cache.setdefault(snapshot, value)
+        return cache.setdefault(snapshot, make(snapshot, *arguments, **named))
 
     return cached
+
+
+def once(make: Callable[Concatenate[Snapshot, P], T]) -> Callable[Concatenate[Snapshot, P], T]:
+    """Do as `once_for_all`, but call the function each time for a snapshot that refits in place modify."""
+    cached = once_for_all(make)
+
+    def present(snapshot: Snapshot, /, *arguments: P.args, **named: P.kwargs) -> T:
+        return (make if snapshot.changes else cached)(snapshot, *arguments, **named)
+
+    return present

@@ -10,6 +10,7 @@ from wrt.accel.base import OneMesh
 from wrt.accel.bvh.builders import BvhOptions, half_areas
 from wrt.accel.geometry import MAX_SPREAD, InstancedGeometry
 from wrt.accel.queries.raw_launches import launch_raw
+from wrt.accel.queries.transforms import transforms_of
 from wrt.core.device import empty_aligned, launch_on, load_kernel, on_host, records, start, upload
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct
 from wrt.kernels.build import moves as kernels
@@ -68,7 +69,7 @@ class TopLevel:
         return out
 
     def place(self, ids: WarpArray, transforms: WarpStruct) -> None:
-        """Write placements and boxes. ids: values of hits.instance; transforms: kernels.build.moves.Transforms. Call `fit` afterwards."""
+        """Write placements and boxes. ids: values of hits.instance; transforms: kernels.transforms.Transforms. Call `fit` afterwards."""
         launch(kernels.place, self.data, ids, transforms, threads=self.threads)
 
     def fit(self, ids: WarpArray) -> None:
@@ -83,16 +84,6 @@ def launch(kernel: Kernel, data: WarpStruct, ids: WarpArray, *inputs: WarpStruct
         launch_raw(kernel, len(ids), data, ids, *inputs, None, threads=threads, step=INSTANCES_PER_JOB)
     else:
         launch_on(device, kernel, len(ids), data, ids, *inputs, None, captured=True)
-
-
-def transforms_of(numbers: WarpArray | np.ndarray, size: int, device: Device, outside: bool = False) -> WarpStruct:
-    """Make kernels.build.moves.Transforms of an array of float32 or float64 with one dimension. size, outside: fields of it."""
-    out = kernels.Transforms()
-    if isinstance(numbers, np.ndarray):
-        numbers = upload(numbers.reshape(-1), wp.float64, device)
-    out.floats, out.doubles = (numbers, None) if numbers.dtype == wp.float32 else (None, numbers)
-    out.size, out.outside = size, outside
-    return out
 
 
 def set_boxes(data: WarpStruct, boxes: list[Boxes], device: Device) -> None:

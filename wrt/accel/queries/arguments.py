@@ -199,9 +199,8 @@ def _without_invalid(rays: Rays) -> Rays:
 
 
 class WorldIds(NamedTuple):
-    """World of each of N rays. first_prim: (W,), index of each world's first primitive among those of all worlds."""
+    """World of each of N rays."""
 
-    first_prim: np.ndarray
     arrays: WarpStruct  # kernels.query.Worlds, on the structure's device
     filtered: bool = False  # True if `arrays` has `exclude` and `mask`.
 
@@ -214,12 +213,7 @@ class WorldIds(NamedTuple):
         """Return the worlds of some of the rays, given by their indices."""
         ids = self.arrays.id
         some = wp.array(ids.numpy()[rays], dtype=wp.int32, device=ids.device)
-        return WorldIds(self.first_prim, filled(Worlds, (some, self.arrays.root)))
-
-    def over_all(self, prim_id: ArrayLike) -> np.ndarray:
-        """Convert prim_ids, which count within a ray's world, to indices among the primitives of all worlds, (N,) int32; -1 stays."""
-        own, world = to_numpy(prim_id), self.arrays.id.numpy()
-        return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
+        return WorldIds(filled(Worlds, (some, self.arrays.root)))
 
 
 def check_world(snapshot: Snapshot, shape: Shape, world: ArrayLike | None = None, exclude: ArrayLike | None = None,
@@ -241,8 +235,7 @@ def check_world(snapshot: Snapshot, shape: Shape, world: ArrayLike | None = None
         ids = _first_axis(str(device), count, int(np.prod(shape)) // count)
     else:
         return None
-    assert isinstance(geometry, InstancedGeometry)
-    return WorldIds(geometry.world_first_prim, filled(Worlds, (ids, snapshot.roots, *filters)), bool(filters))
+    return WorldIds(filled(Worlds, (ids, snapshot.roots, *filters)), bool(filters))
 
 
 def _filters(snapshot: Snapshot, shape: Shape, exclude: ArrayLike | None, mask: ArrayLike | None) -> list[WarpArray]:

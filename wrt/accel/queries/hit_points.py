@@ -9,12 +9,13 @@ from typing import Any, Generic, NamedTuple, TypeAlias
 import numpy as np
 import warp as wp
 
+from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, run_of
-from wrt.accel.geometry import Geometry, InstancedGeometry, NumberedGeometry
+from wrt.accel.geometry import Geometry, InstancedGeometry, MovedGeometry, NumberedGeometry
 from wrt.accel.queries.arguments import WorldIds, in_shape, over_worlds
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import rays_on, to_origin
-from wrt.accel.snapshot import Snapshot, once
+from wrt.accel.snapshot import Snapshot, once, once_for_all
 from wrt.core.arrays import from_tensor, given_like, to_numpy, to_tensor_like, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
@@ -22,7 +23,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, ArrayT, WarpArray, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels import structs
-from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.query import HitArrays, RayArrays, Worlds
 from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
@@ -36,6 +37,16 @@ class DeviceScene(NamedTuple):
     scene: FlatScene
     surfaces: WarpStruct
     object_ids: WarpStruct
+    rows: WarpArray | None = None  # Instance of each run of surfaces.instances; -1: none.
+
+    def follow(self, snapshot: Snapshot) -> None:
+        """Write the matrices of instances that moved in place."""
+        if isinstance(snapshot.geometry, MovedGeometry):
+            from wrt.kernels.shade.hit_points import place_instances
+
+            instances = self.surfaces.instances
+            launch_on(snapshot.device, place_instances, len(instances), self.rows, snapshot.geometry.places, instances,
+                      captured=True)
 
 
 class PartFaces(NamedTuple):
@@ -101,23 +112,23 @@ class HitIds(Generic[ArrayT]):
         origin = snapshot.geometry.origin
         if name in ("error", "normal", "shading", "uv") or (name == "point" and origin is not None):
             check_recorded(self, name)
-        scene, surfaces, object_ids = device_scene(snapshot)
+        on_device = device_scene(snapshot)
+        scene = on_device.scene
+        if name in FROM_RAYS:
+            on_device.follow(snapshot)
         if name == "shading" and scene.normals is None:
             name = "normal"
-        _require(scene, name)
-        to_own = own_ids(name, scene, worlds)
+        require(scene, name)
+        to_own = own_materials(scene, worlds) if name == "material" else None
         if to_own is not None or not isinstance(self.prim_id, wp.array):  # computed on the host
             refuse_capture(device)
-        if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
-            name = "instance" if scene.objects is None else "object"
         out: Any = HitPlaces()
         setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
         hits: Any = HitArrays()
         for each in fields_of(HitArrays) if name in FROM_RAYS else ("prim_id",):
             setattr(hits, each, in_shape(to_warp(getattr(self, each)).to(device), (n,)))
-        if worlds is not None:
-            hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
-        inputs = [surfaces, object_ids, rays_on(device, rays) if name in FROM_RAYS else RayArrays(), hits, out]
+        inputs = [on_device.surfaces, on_device.object_ids, rays_on(device, rays) if name in FROM_RAYS else RayArrays(),
+                  Worlds() if worlds is None else worlds.arrays, hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH, captured=True)
         if to_own is not None:
             array = upload(to_own(array.numpy()), wp.int32, device)
@@ -234,7 +245,7 @@ class HitPoints(HitIds[ArrayT]):
         return found
 
 
-def _require(scene: FlatScene, name: str) -> None:
+def require(scene: FlatScene, name: str) -> None:
     """Raise InputError if hits in this scene do not have the property."""
     if name == "uv" and not len(scene.uvs):
         raise InputError("the mesh has no texture coordinates (uvs)", hint="the weights of a face's corners are hits.u and hits.v")
@@ -244,18 +255,15 @@ def _require(scene: FlatScene, name: str) -> None:
         raise InputError(f"hits have no {name}, because the structure is not over a scene", hint="wrt.build(wrt.Scene.of([mesh]))")
 
 
-def own_ids(name: str, scene: FlatScene, worlds: WorldIds | None) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the function that converts ids among all worlds, (N,) int32, to those of each ray's world, or None."""
-    geometry, own = scene.geometry, scene.own_materials
-    if own is None or name not in ("object", "material") or not over_worlds(geometry):
+def own_materials(scene: FlatScene, worlds: WorldIds | None) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the function that converts materials among all worlds, (N,) int32, to those of each ray's world, or None."""
+    own = scene.own_materials
+    if own is None or not over_worlds(scene.geometry):
         return None
 
     def convert(ids: np.ndarray) -> np.ndarray:
         world = np.zeros(len(ids), np.int64) if worlds is None else worlds.arrays.id.numpy()
         hit = ids >= 0
-        if name == "object":
-            first = geometry.first_instance[np.where(hit, world, 0)]
-            return np.where(hit, ids - first, -1).astype(np.int32)
         step = int(own[:, 1].max(initial=0)) + 1
         row = np.searchsorted(own[:, 0] * step + own[:, 1], world[hit] * step + ids[hit])
         out = np.full(len(ids), -1, np.int32)
@@ -265,16 +273,19 @@ def own_ids(name: str, scene: FlatScene, worlds: WorldIds | None) -> Callable[[n
     return convert
 
 
-@once
+@once_for_all
 def device_scene(snapshot: Snapshot) -> DeviceScene:
-    """Upload the scene of a structure to its device."""
+    """Upload the scene of a structure to its device. Moves in place: see DeviceScene.follow."""
     from wrt.kernels.shade.hit_points import ObjectIds
 
     geometry, device = snapshot.geometry, snapshot.device
     scene, surfaces = snapshot.attributes or flat_scene_of(geometry), structs.Surfaces()
     placed = placed_now(scene, geometry)
     surfaces.n_triangles = geometry.n_triangles
-    surfaces.vertices = upload(geometry.vertices if isinstance(geometry, Geometry) else scene.vertices, wp.vec3, device)
+    if isinstance(geometry, DeviceGeometry) and geometry.points.device == device:
+        surfaces.vertices = geometry.points  # which refits in place write
+    else:
+        surfaces.vertices = upload(geometry.vertices if isinstance(geometry, Geometry) else scene.vertices, wp.vec3, device)
     surfaces.faces = upload(scene.faces, wp.vec3i, device)
     surfaces.normals = upload(np.zeros((1, 3)) if scene.normals is None else scene.normals, wp.vec3, device)
     surfaces.uvs = upload(scene.uvs, wp.vec2, device)
@@ -283,12 +294,17 @@ def device_scene(snapshot: Snapshot) -> DeviceScene:
     object_ids = ObjectIds()
     first = geometry.first_prim if isinstance(geometry, InstancedGeometry) else np.zeros(1)
     object_ids.first_prim = upload(first if scene.objects is None else scene.objects, wp.int32, device)
-    if placed is not None and isinstance(geometry, InstancedGeometry):
-        surfaces.instances = upload(instance_records(placed), structs.Instance, device)
-        instance = np.zeros(len(placed.first_prim), np.int32)  # of each run; 0 for joined objects and spheres
-        instance[run_of(placed, geometry)] = np.flatnonzero(geometry.is_placed)
-        object_ids.instance = upload(instance, wp.int32, device)
-    return DeviceScene(scene, surfaces, object_ids)
+    if over_worlds(geometry):
+        object_ids.world_prim = upload(geometry.world_first_prim, wp.int32, device)
+        object_ids.world_object = upload(geometry.first_instance, wp.int32, device)
+    if placed is None or not isinstance(geometry, InstancedGeometry):
+        return DeviceScene(scene, surfaces, object_ids)
+    surfaces.instances = upload(instance_records(placed), structs.Instance, device)
+    rows = np.full(len(placed.first_prim), -1, np.int32)  # of each run; -1 for joined objects and spheres
+    rows[run_of(placed, geometry)] = np.flatnonzero(geometry.is_placed)
+    if scene.objects is None:
+        object_ids.instance = upload(np.maximum(rows, 0), wp.int32, device)
+    return DeviceScene(scene, surfaces, object_ids, upload(rows, wp.int32, device))
 
 
 def instance_records(placed: Placed) -> np.ndarray:
