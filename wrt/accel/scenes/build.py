@@ -19,7 +19,7 @@ from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, flat_scene_of
 from wrt.accel.geometry import Geometry, InstancedGeometry
 from wrt.accel.instances import Instances
-from wrt.accel.scenes.flatten import flatten, worlds_over
+from wrt.accel.scenes.flatten import flatten, with_shared, worlds_over
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.store import read
 from wrt.accel.structures import ACCELERATORS
@@ -83,9 +83,9 @@ def build(mesh: SceneLike, accel: str = ..., device: str | None = ..., threads: 
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
 @overload
 def build(mesh: list[WorldT], accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: bool = ...,
-          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
+          shared: MeshLike | None = ..., progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = None, threads: int | None = None, *,
-          movable: bool = False, progress: Callable[[float], None] | None = None,
+          movable: bool = False, shared: MeshLike | None = None, progress: Callable[[float], None] | None = None,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
 
@@ -106,6 +106,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
         Threads that build and refit; one per core by default.
     movable : bool
         Make each object of the scene, or the mesh, an instance that `Instances.move` moves. Not for scenes with spheres.
+    shared : mesh or scene as above, optional
+        Objects of all worlds of a list, such as a terrain, behind each world's own. Their meshes are stored once.
     progress : function, optional
         Function that is called with the finished share of the build, 0 to 1, perhaps from several threads.
     **options
@@ -129,7 +131,10 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
     kind, device = ACCELERATORS[accel], device_of(mesh, device)
     if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
+    if shared is not None and (unnamed or not isinstance(mesh, list)):
+        raise InputError("is for several worlds, a list", argument="shared", hint="wrt.build([scene, ...], shared=terrain)")
+    common = None if shared is None else to_mesh_or_scene(shared)
+    flat: Any = (worlds_over(with_shared([to_mesh_or_scene(each) for each in mesh], common), unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = own(mesh) if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind

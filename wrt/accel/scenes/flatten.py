@@ -15,6 +15,7 @@ from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.model import Object, Scene, moved_by, scene_origin
 
 MOST = 2**31 - 2  # faces, and vertices
+GREY = Material()
 
 
 def flatten(scene: Scene, meshes: frozenset[int] = frozenset()) -> FlatScene:
@@ -98,6 +99,16 @@ def _placed_scene(scene: Scene, index: dict[int, int], parts: "dict[int, _Joined
                  _first_prims(scene), names=tuple(thing.name for thing in scene.objects))
 
 
+def with_shared(worlds: Sequence[Mesh | Scene], shared: Mesh | Scene | None) -> Sequence[Mesh | Scene]:
+    """Add the objects of `shared` to each world, behind its own. Raises InputError for spheres."""
+    if shared is None:
+        return worlds
+    scenes = [each if isinstance(each, Scene) else Scene((_alone(each),)) for each in (*worlds, shared)]
+    if scenes[-1].spheres:
+        raise InputError("has spheres, but only meshes are in worlds", argument="shared", hint=MESH_OF_A_SPHERE)
+    return [replace(each, objects=each.objects + scenes[-1].objects) for each in scenes[:-1]]
+
+
 def worlds_over(worlds: Sequence[Mesh | Scene], unnamed: bool = False) -> FlatScene:
     """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects.
     unnamed: the caller has one scene and knows no world, so that messages name none."""
@@ -110,8 +121,7 @@ def worlds_over(worlds: Sequence[Mesh | Scene], unnamed: bool = False) -> FlatSc
         if isinstance(scene, Scene) and scene.spheres:
             raise InputError("has spheres, but only meshes move (movable=True) or are in worlds", place=place or "the scene",
                              hint=MESH_OF_A_SPHERE)
-    grey = (Material(),)
-    objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey, name=scene.name),) for scene in worlds]
+    objects = [scene.objects if isinstance(scene, Scene) else (_alone(scene),) for scene in worlds]
     together = tuple(thing for each in objects for thing in each)
     if not together:
         raise InputError("must have at least one object in all its worlds together", argument="mesh")
@@ -124,9 +134,13 @@ def worlds_over(worlds: Sequence[Mesh | Scene], unnamed: bool = False) -> FlatSc
     assert isinstance(geometry, InstancedGeometry)
     places = {id(material): i for i, material in enumerate(joined.materials)}
     own = [(world, places[id(material)], i) for world, scene in enumerate(worlds)
-           for i, material in enumerate(scene.materials if isinstance(scene, Scene) else grey)]
+           for i, material in enumerate(scene.materials if isinstance(scene, Scene) else (GREY,))]
     return replace(flat, geometry=replace(geometry, origin=origin, worlds=np.cumsum([0, *map(len, objects)])), objects=None,
                    own_materials=np.array(sorted(own), np.int64).reshape(-1, 3))
+
+
+def _alone(mesh: Mesh) -> Object:
+    return Object(mesh, (GREY,), name=mesh.name)
 
 
 def _is_smooth(scene: Scene) -> bool:

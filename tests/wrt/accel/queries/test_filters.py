@@ -193,3 +193,23 @@ def test_structures_without_masks():
         wrt.ray_query("bvh", filtered=True)
     one = wrt.build(icosphere(1), movable=True)
     assert one.any_hit(o, -o).all() and not one.any_hit(o, -o, exclude=0).any() and one.bodies.numpy().tolist() == [0]
+
+
+def test_shared_objects_equal_copies_in_each_world():
+    (o, d), shared = rays(), Scene((Object(icosphere(3), (wrt.Material(), ), np.diag([4.0, 4.0, 0.25, 1.0]), name="terrain"),
+                                    Object(icosphere(1), GREY, name="rock")))
+    accel = wrt.build([*scenes(), icosphere(1)], shared=shared)
+    world = np.arange(len(o)) % 4
+    hits = accel.closest_hit(o, d, world=world)
+    for i, own in enumerate((*(each.objects for each in scenes()), (Object(icosphere(1), GREY),))):
+        alone = wrt.build(Scene(own + shared.objects), movable=True).closest_hit(o[world == i], d[world == i])
+        for name in ("t", "prim_id", "object", "face", "material"):
+            assert np.array_equal(getattr(hits, name)[world == i], getattr(alone, name)), name
+        assert (alone.object >= len(own)).any()
+    parts = accel.geometry.part[accel.geometry.worlds[1:] - 2]
+    assert len(set(parts)) == 1  # stored once
+    accel.masks.assign(np.where(np.arange(len(accel.masks)) == accel.geometry.worlds[1] - 2, 1, 3))
+    assert not (accel.closest_hit(o, d, world=0, mask=2).object == COUNTS[0]).any()
+    for bad in ([icosphere(0)], icosphere(0)):
+        with refused("shared"):
+            wrt.build(bad, shared=Scene((), spheres=(wrt.Sphere((0.0, 0.0, 0.0), 1.0, GREY[0]),)))
