@@ -16,10 +16,15 @@ from wrt.testing import Bodies, bodies
 RAYS = 400
 
 
-@pytest.mark.parametrize("trace", [with_wrt, with_warp])
-def test_no_ray_is_wrong(trace) -> None:
-    report = bodies(trace, rays=RAYS)
+def test_no_ray_of_wrt_is_wrong() -> None:
+    report = bodies(with_wrt, rays=RAYS)
     assert report.ok and report.total.rays == RAYS * len(CASES), str(report)
+
+
+def test_few_rays_of_other_code_are_wrong() -> None:
+    """Warp's meshes leak at edges and corners; nearly all other answers are right, by code that shares nothing with wrt."""
+    report = bodies(with_warp, rays=RAYS)
+    assert all(result.raised is None for result in report.results) and report.total.wrong < 0.01 * report.total.rays, str(report)
 
 
 def without_move(case: Bodies) -> Answer:
