@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.arrays import to_numpy
+from wrt.core.arrays import contiguous, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on
 from wrt.core.errors import InputError
@@ -65,7 +65,7 @@ class DeviceGeometry(Geometry):
         """Return a Warp array (V,) of vec3 as a contiguous array. Raises InputError, which names the argument, for anything else."""
         if not (isinstance(array, wp.array) and array.dtype == wp.vec3 and array.ndim == 1):
             raise InputError(f"must be a Warp array (V,) of vec3, got {shown(array)}", argument=name)
-        return array if array.is_contiguous else array.contiguous()
+        return contiguous(array)
 
     @staticmethod
     def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from wrt.core.types import WarpArray
 
 NEEDED = ("shape_type", "shape_flags", "shape_body", "shape_world", "shape_scale", "shape_transform", "shape_source", "shape_label",
-          "shape_source_ptr", "shape_opacity", "heightfield_meshes", "world_count", "body_q", "device")  # fields of a newton.Model
+          "shape_source_ptr", "shape_opacity", "heightfield_meshes", "world_count", "body_q", "body_count", "device")  # fields of a Model
 RAYS = {"ray_origins": wp.vec3, "ray_directions": wp.vec3, "ray_worlds": wp.int32}
 RESULTS = {"out_dist": wp.float32, "out_normal": wp.vec3, "out_shape_id": wp.int32}  # in the order of kernels.shape_rays.Answers
 
@@ -127,7 +127,9 @@ class ModelScene:
         launch_on(self.device, kernel, n, *inputs, None, threads=thread_count(None), step=16384, captured=True)
 
     def _place(self, state: Any) -> None:
-        bodies = wp.empty(0, dtype=wp.transformf, device=self.device) if state.body_q is None else state.body_q
+        count = self.model.body_count
+        given = getattr(state, "body_q", None) if count else wp.empty(0, dtype=wp.transformf, device=self.device)
+        (bodies,) = self._checked((count,), {"body_q": wp.transformf}, {"body_q": given})
         self._launch(place_shapes, len(self.shape), self._shapes, self.model.shape_body, self.model.shape_transform, bodies, self._poses)
 
     def follow(self, state: Any) -> None:
@@ -136,7 +138,7 @@ class ModelScene:
         Parameters
         ----------
         state : newton.State
-            State whose `body_q` is read, on the model's device.
+            State of this model; its `body_q` is read. InputError if it is not one row per body, on the model's device.
         """
         self._place(state)
         self.accel.move(self._poses)

@@ -287,6 +287,10 @@ def test_bad_input() -> None:
                       ("ray_origins", wp.zeros((10, 3))[::2]), ("out_normal", wp.zeros(6, dtype=wp.vec3))):
         with refused(name, "must be a contiguous Warp array"):
             found.intersect_ray(**{**rays, name: bad})
+    poses = model.state().body_q
+    for bad in (None, poses[:0], wp.clone(poses).numpy(), wp.zeros(len(poses), dtype=wp.vec3)):
+        with refused("body_q", "must be a contiguous Warp array (1,) of transformf"):
+            found.follow(SimpleNamespace(body_q=bad))
     none = wp.zeros(0, dtype=wp.vec3)
     found.intersect_ray(ray_origins=none, ray_directions=none, ray_worlds=wp.zeros(0, dtype=wp.int32), out_dist=wp.zeros(0, dtype=float))
     away = wp.array([9, -2, 0], dtype=wp.int32)  # worlds that do not exist; a direction that is NaN

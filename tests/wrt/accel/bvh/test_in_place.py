@@ -163,6 +163,8 @@ def test_a_graph_of_the_cpu_captures_a_refit_in_place() -> None:
     with refused(None, "the first refit in place"), wp.ScopedCapture("cpu"):
         accel.refit(points, in_place=True)
     accel.refit(points, in_place=True)
+    with refused(None, "cannot be captured in a graph"), wp.ScopedCapture("cpu"):
+        accel.refit(wp.zeros(2 * len(points), dtype=wp.vec3, device="cpu")[::2], in_place=True)
     with wp.ScopedCapture("cpu") as capture:
         accel.refit(points, in_place=True)
     for case in ("moved", "nan"):
