@@ -249,7 +249,7 @@ def test_a_step_is_one_graph_of_the_cpu(kind: str, form: str) -> None:
             rays = np.random.default_rng(4).normal(size=(2, n, 3))
             self.rays = [wp.array(each, dtype=wp.vec3, device="cpu") for each in rays]
             world = wp.array(np.arange(n) % 3, dtype=wp.int32, device="cpu")  # 2 does not exist
-            self.options = {"world": world} if form == "worlds" else {}
+            self.options: Any = {"worlds": {"world": world}, "instances": {"exclude": 1, "mask": 3}}.get(form, {})
             self.points = wp.array(BALL.vertices, dtype=wp.vec3, device="cpu")
             self.poses = wp.zeros(5 if form == "worlds" else 3, dtype=wp.transformf, device="cpu")
             self.poses.assign(np.random.default_rng(5).normal(size=(len(self.poses), 7)))

@@ -245,9 +245,24 @@ def _filters(snapshot: Snapshot, shape: Shape, exclude: ArrayLike | None, mask: 
     if snapshot.bodies is None:
         raise InputError("is for structures all of whose objects are instances", argument="mask" if exclude is None else "exclude",
                          hint="wrt.build(scene, movable=True) makes some")
-    exclude, mask = (-1 if value is None else value for value in (exclude, mask))
-    return [_on_device(indices_of(exclude, shape, "exclude", -1, 1 << 31), snapshot.device),
-            _on_device(indices_of(mask, shape, "mask", -1 << 31, 1 << 32), snapshot.device)]
+    numbers, n = [], int(np.prod(shape))
+    for value, name, low, count in ((exclude, "exclude", -1, 1 << 31), (mask, "mask", -1 << 31, 1 << 32)):
+        if value is None or isinstance(value, int | np.integer):
+            one = indices_of(-1 if value is None else value, (1,), name, low, count)
+            numbers.append(_same_of_all(int(one[0]), n, snapshot.device))
+        else:
+            numbers.append(_on_device(indices_of(value, shape, name, low, count), snapshot.device))
+    return numbers
+
+
+def _same_of_all(value: int, n: int, device: Device) -> WarpArray:
+    """Return an array (n,) int32 of one value. A graph can capture this call, and then has the array."""
+    return wp.full(n, value, dtype=wp.int32, device=device) if device.is_capturing else _kept(value, n, str(device))
+
+
+@lru_cache(8)  # so that a step of a simulation makes it once
+def _kept(value: int, n: int, device: str) -> WarpArray:
+    return upload(np.full(n, value, np.int32), wp.int32, wp.get_device(device))
 
 
 def _on_device(ids: Any, device: Device) -> WarpArray:
