@@ -23,6 +23,17 @@ class Answers:
     shape: wp.array(dtype=wp.int32)
 
 
+@wp.struct
+class GeomRays:
+    """Rays in rows of a world each. Those given have one row for all worlds or a row for each, and no mask and world."""
+
+    origin: wp.array2d(dtype=wp.vec3)
+    direction: wp.array2d(dtype=wp.vec3)
+    exclude: wp.array2d(dtype=wp.int32)  # Body that the ray does not see, or -1; given as one row.
+    mask: wp.array2d(dtype=wp.int32)
+    world: wp.array2d(dtype=wp.int32)
+
+
 @kernel
 def place_shapes(shapes: Shapes, shape_body: wp.array(dtype=wp.int32), shape_pose: wp.array(dtype=wp.transformf),
                  body_pose: wp.array(dtype=wp.transformf), poses: wp.array(dtype=wp.transformf), first: int):
@@ -47,6 +58,26 @@ def place_geoms(geom_of: wp.array(dtype=wp.int32), count: int, hidden: wp.array(
         for j in range(3):
             poses[i, k, j] = turn[9 * at + 3 * k + j]
         poses[i, k, 3] = wp.where(hidden[row] > 0, wp.nan, position[3 * at + k])
+
+
+@kernel
+def spread_rays(given: GeomRays, planes: wp.array(dtype=wp.int32), count: int, turn: wp.array(dtype=wp.float32), out: GeomRays, first: int):
+    """Write the rays of all worlds. planes: geoms that only rays against their axis z see; the k-th has bit k + 1 of masks, and other
+    geoms have bit 0. count, turn: see place_geoms."""
+    i = first + wp.tid()
+    world = i / out.origin.shape[1]
+    ray = i % out.origin.shape[1]
+    direction = given.direction[world % given.direction.shape[0], ray]
+    mask = int(1)
+    for k in range(planes.shape[0]):
+        at = 9 * (world * count + planes[k])
+        if wp.dot(direction, wp.vec3(turn[at + 2], turn[at + 5], turn[at + 8])) < 0.0:
+            mask |= 2 << k
+    out.origin[world, ray] = given.origin[world % given.origin.shape[0], ray]
+    out.direction[world, ray] = direction
+    out.exclude[world, ray] = given.exclude[0, ray]
+    out.mask[world, ray] = mask
+    out.world[world, ray] = world
 
 
 @kernel

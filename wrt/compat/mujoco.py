@@ -1,4 +1,4 @@
-"""Rays among the geoms of a MuJoCo model, with wrt's queries: `mj_ray` and `mj_multiRay`, and poses from mujoco-warp."""
+"""Rays among the geoms of a MuJoCo model, with wrt's queries: `mj_ray`, `mj_multiRay`, and mujoco-warp's `rays`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
+from wrt.accel.queries.rays import filled
 from wrt.accel.scenes.build import build
 from wrt.compat.common import turned
 from wrt.core.checks import shown
@@ -14,7 +15,7 @@ from wrt.core.device import launch_on, start, upload
 from wrt.core.errors import InputError, warn
 from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.threads import thread_count
-from wrt.kernels.shape_rays import place_geoms
+from wrt.kernels.shape_rays import Answers, GeomRays, Shapes, place_geoms, spread_rays, write_answers
 from wrt.scene import shapes
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
@@ -22,11 +23,12 @@ from wrt.scene.model import Object, Scene
 if TYPE_CHECKING:
     import mujoco
 
-    from wrt.core.types import ArrayLike
+    from wrt.core.types import ArrayLike, WarpArray
 
 KINDS = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")  # by mujoco.mjtGeom
 SEGMENTS = 128  # edges of the circles of curved geoms
 MOST = 1e10  # mujoco.mjMAXVAL
+PLANES = 31  # that fit in masks of 32 bits
 
 
 def from_mujoco(model: mujoco.MjModel, data: Any = None, *, device: str | None = None, threads: int | None = None,
@@ -34,8 +36,8 @@ def from_mujoco(model: mujoco.MjModel, data: Any = None, *, device: str | None =
     """Build a structure over the geoms of a MuJoCo model, which follows its simulation.
 
     Planes, boxes, meshes and height fields (with walls and base) are exact, but endless planes are squares of 20 km. Spheres, capsules,
-    ellipsoids and cylinders are meshes at most 0.0006 of the radius below the surface. SDFs, flexes and skins are named in one warning and
-    left out.
+    ellipsoids and cylinders are meshes at most 0.0006 of the radius below the surface. SDFs, flexes, skins and planes behind the 31st are
+    named in one warning and left out.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ def from_mujoco(model: mujoco.MjModel, data: Any = None, *, device: str | None =
     Returns
     -------
     ModelGeoms
-        Structure that follows the simulation, with `ray` and `multi_ray`.
+        Structure that follows the simulation, with `ray`, `multi_ray` and `rays`.
 
     Raises
     ------
@@ -105,11 +107,12 @@ def _meshes(model: mujoco.MjModel) -> dict[int, Mesh]:
     """Return the meshes of geoms, by index; equal geoms share one. What cannot be traced is named in a warning."""
     known: dict[tuple[object, ...], Mesh | None] = {}
     out, left = {}, [f"{count} {what}" for count, what in ((model.nflex, "flexes"), (model.nskin, "skins")) if count]
+    planes = np.flatnonzero(model.geom_type == 0)
     for geom in range(model.ngeom):
         key = (int(model.geom_type[geom]), int(model.geom_dataid[geom]), *model.geom_size[geom].tolist())
         if key not in known:
             known[key] = _mesh_of(model, geom)
-        if (mesh := known[key]) is None:
+        if (mesh := known[key]) is None or geom in planes[PLANES:]:
             left.append(f"geom {geom} {model.geom(geom).name!r}")
         else:
             out[geom] = mesh
@@ -122,7 +125,8 @@ def _meshes(model: mujoco.MjModel) -> dict[int, Mesh]:
 
 class ModelGeoms:
     """The geoms of a MuJoCo model, made by `from_mujoco`. `accel` is the structure over the worlds, without the geoms that the last
-    call filtered. Its planes have two sides. `geom`, (G,) int32, is the model's index of each object of a world (`hits.object`)."""
+    call filtered. Its planes have two sides, its `bodies` are `geom_bodyid`, and its `masks` are for `rays`. `geom`, (G,) int32, is the
+    model's index of each object of a world (`hits.object`)."""
 
     def __init__(self, model: mujoco.MjModel, data: Any, device: str, threads: int, options: dict[str, Any]) -> None:
         self.model, self.device, self.threads = model, start(device), threads
@@ -136,9 +140,19 @@ class ModelGeoms:
         self._place()
         poses = np.tile(np.eye(4), (self.worlds, len(meshes), 1, 1))
         poses[..., :3, :] = self._poses.numpy().reshape(self.worlds, len(meshes), 3, 4)
-        self.accel = build([Scene(tuple(Object(mesh, transform=pose) for mesh, pose in zip(meshes.values(), each, strict=True)))
-                            for each in poses], device=str(self.device), threads=threads, **options)
+        self.accel: Any = build([Scene(tuple(Object(mesh, transform=pose) for mesh, pose in zip(meshes.values(), each, strict=True)))
+                                 for each in poses], device=str(self.device), threads=threads, **options)
         self.accel.move(self._poses)  # the first move in place makes arrays
+        plane, first = model.geom_type[self.geom] == 0, (self.accel.geometry.first_instance, self.accel.geometry.first_prim_in_world)
+        masks = np.where(plane, 1 << np.cumsum(plane), 1)  # see spread_rays
+        for array, values in ((self.accel.bodies, model.geom_bodyid[self.geom]), (self.accel.masks, masks)):
+            array.assign(np.tile(values, self.worlds).astype(np.int32))
+        self._planes, *shapes_of = (upload(each, wp.int32, self.device) for each in (
+            self.geom[plane], np.tile(self.geom, self.worlds), *first))
+        self._shapes = filled(Shapes, shapes_of)
+
+    def _launch(self, kernel: Any, n: int, *inputs: object) -> None:
+        launch_on(self.device, kernel, n, *inputs, None, threads=self.threads, step=16384, captured=True)
 
     def _read(self, data: Any) -> None:
         """Keep the poses of a state: Warp arrays as they are, else a copy."""
@@ -154,8 +168,8 @@ class ModelGeoms:
         self._state = arrays
 
     def _place(self) -> None:
-        launch_on(self.device, place_geoms, len(self._poses), self._geom_of, self.model.ngeom, self._filter,
-                  *(flat for flat, _ in self._state), self._poses, None, threads=self.threads, step=16384, captured=True)
+        self._launch(place_geoms, len(self._poses), self._geom_of, self.model.ngeom, self._filter, *(flat for flat, _ in self._state),
+                     self._poses)
 
     def follow(self, data: Any) -> None:
         """Move all geoms to their poses, in place. Rays miss a geom whose pose is NaN (`accel.invalid_moves`).
@@ -174,11 +188,16 @@ class ModelGeoms:
         self._place()
         self.accel.move(self._poses)
 
-    def _hide(self, hidden: np.ndarray) -> None:
-        """Remove these of the geoms (ngeom,) from the structure, and those without opacity; put back the others."""
+    def _hide(self, geomgroup: ArrayLike | None, flg_static: bool, hidden: np.ndarray) -> None:
+        """Remove these geoms, (ngeom,), those of groups, static ones and those without opacity from the structure; put back the others."""
         m, material = self.model, self.model.geom_matid
         opacity = np.where(material < 0, m.geom_rgba[:, 3], m.mat_rgba[material, 3] if m.nmat else 1.0)
-        if ((hidden := (hidden | (opacity == 0.0))[self.geom]) != self._hidden).any():
+        groups = np.ones(6) if geomgroup is None else np.array([*cast(Any, geomgroup)])
+        if groups.shape != (6,):
+            raise InputError(f"must have 6 numbers, got {shown(geomgroup)}", argument="geomgroup")
+        hidden = (hidden | (opacity == 0.0) | (groups[np.clip(m.geom_group, 0, 5)] == 0)
+                  | ((m.body_weldid[m.geom_bodyid] == 0) & (not flg_static)))[self.geom]
+        if (hidden != self._hidden).any():
             self._hidden = hidden
             self._filter.assign(hidden.astype(np.int32))
             self._place()
@@ -228,26 +247,62 @@ class ModelGeoms:
         Raises
         ------
         InputError
-            For other shapes, and for several worlds: use `accel.closest_hit`.
+            For other shapes, and for several worlds: use `rays`.
         """
         m, (position, turn) = self.model, (array.numpy().reshape(self.worlds * self.model.ngeom, -1) for _, array in self._state)
         origin, directions = (np.asarray(each, np.float32).reshape(-1) for each in (pnt, vec))
-        groups = np.ones(6) if geomgroup is None else np.asarray(geomgroup).reshape(-1)
-        for name, array, size in (("pnt", origin, 3), ("vec", directions, 3 * nray), ("geomgroup", groups, 6), ("dist", dist, nray),
-                                  ("geomid", geomid, nray), ("normal", normal, 3 * nray)):
+        for name, array, size in (("pnt", origin, 3), ("vec", directions, 3 * nray), ("dist", dist, nray), ("geomid", geomid, nray),
+                                  ("normal", normal, 3 * nray)):
             if array is not None and array.size != size:
                 raise InputError(f"must have {size} numbers, got {shown(array)}", argument=name)
         if self.worlds != 1:
-            raise InputError(f"answers one world, not {self.worlds}", place="multi_ray", hint="use accel.closest_hit")
+            raise InputError(f"answers one world, not {self.worlds}", place="multi_ray", hint="use rays")
         below = np.einsum("ij,ij->i", turn[:, 2::3], origin - position) < 0.0
         away = (np.linalg.norm(position - origin, axis=1) > cutoff + m.geom_rbound) & (m.geom_rbound > 0.0)
-        self._hide(away | (below & (m.geom_type == 0)) | (m.geom_bodyid == bodyexclude) | (groups[np.clip(m.geom_group, 0, 5)] == 0)
-                   | ((m.body_weldid[m.geom_bodyid] == 0) & (not flg_static)))
+        self._hide(geomgroup, flg_static, away | (below & (m.geom_type == 0)) | (m.geom_bodyid == bodyexclude))
         rays = (upload(np.broadcast_to(each.reshape(-1, 3), (nray, 3)), wp.vec3, self.device) for each in (origin, directions))
-        hits = cast(Any, self.accel).closest_hit(*rays, threads=self.threads)  # of Warp arrays: rays that are not valid miss
+        hits = self.accel.closest_hit(*rays, threads=self.threads)  # of Warp arrays: rays that are not valid miss
         hit, prim_id = (t := hits.t.numpy()) < np.inf, hits.prim_id.numpy()
         dist.reshape(-1)[:] = np.where(hit, t, -1.0)
         if geomid is not None:
             geomid.reshape(-1)[:] = self._of_prim[prim_id]
         if normal is not None:
             normal.reshape(-1, 3)[:] = np.where(hit[:, None], hits.shading_normal.numpy(), 0.0)
+
+    def rays(self, pnt: WarpArray, vec: WarpArray, geomgroup: ArrayLike | None, flg_static: bool, bodyexclude: WarpArray, dist: WarpArray,
+             geomid: WarpArray, normal: WarpArray) -> None:
+        """Find the closest geom on rays of all worlds, as `mujoco_warp.rays` does after its first two arguments, at the last `follow`.
+
+        Parameters
+        ----------
+        pnt, vec : (1, N) or (W, N) Warp arrays of vec3
+            Origins and directions; with one row, all W worlds have the same.
+        geomgroup, flg_static
+            See `multi_ray`; a group of -1 is seen.
+        bodyexclude : (N,) Warp array of int32
+            Body whose geoms the ray does not see, or -1.
+        dist, geomid, normal : (W, N) Warp arrays of float32, int32 and vec3
+            Receive the answers of `multi_ray`.
+
+        Raises
+        ------
+        InputError
+            For arrays of another shape, type or device.
+        """
+        n = tuple(getattr(vec, "shape", ()))[-1:]
+        every, one = (self.worlds, *n), (1, *n)
+        for name, array, kind, forms in (("pnt", pnt, wp.vec3, (one, every)), ("vec", vec, wp.vec3, (one, every)),
+                                         ("bodyexclude", bodyexclude, wp.int32, (n,)), ("dist", dist, wp.float32, (every,)),
+                                         ("geomid", geomid, wp.int32, (every,)), ("normal", normal, wp.vec3, (every,))):
+            if not (isinstance(array, wp.array) and array.is_contiguous and (array.dtype, array.device) == (kind, self.device)
+                    and array.shape in forms):
+                raise InputError(f"must be a contiguous Warp array {forms[-1]} of {kind.__name__} on {self.device}, got {shown(array)}",
+                                 argument=name)
+        self._hide(geomgroup, flg_static, np.zeros(self.model.ngeom, bool))
+        arrays = [wp.empty(every, dtype=kind, device=self.device) for kind in (wp.vec3, wp.vec3, wp.int32, wp.int32, wp.int32)]
+        given = filled(GeomRays, (pnt, vec, bodyexclude.reshape(one)))
+        self._launch(spread_rays, dist.size, given, self._planes, self.model.ngeom, self._state[1][0], filled(GeomRays, arrays))
+        origin, direction, exclude, mask, world = (each.flatten() for each in arrays)
+        hits = self.accel.closest_hit(origin, direction, exclude=exclude, mask=mask, world=world, threads=self.threads)
+        found, out = (hits.t, hits.shading_normal, hits.prim_id), (each.flatten() for each in (dist, normal, geomid))
+        self._launch(write_answers, dist.size, self._shapes, world, filled(Answers, found), filled(Answers, out))

@@ -154,6 +154,34 @@ def test_worlds_of_mujoco_warp(scene: Any) -> None:
         assert np.isfinite(hits.t).any() and np.allclose(hits.t[hits.hit], dist[hits.hit], atol=1e-5)
     with refused(None, "one world", place="multi_ray"):
         own.ray(ORIGINS[0], (0.0, 0.0, 1.0))
+    rng, group = np.random.default_rng(3), [-1.0] * 6
+    vec, body = directions(n) / np.linalg.norm(directions(n), axis=1, keepdims=True), rng.integers(-1, model.nbody, n)
+    with wp.ScopedDevice("cpu"):
+        for rows, groups, static in ((1, group, True), (3, [1.0, 0.0, 1.0, 1.0, 1.0, 1.0], True), (3, group, False)):
+            pnt = wp.array(rng.choice(ORIGINS[:2] + ORIGINS[4:], (rows, n)), dtype=wp.vec3)
+            rays = pnt, wp.array(np.tile(vec, (rows, 1, 1)), dtype=wp.vec3), groups, static, wp.array(body, dtype=wp.int32)
+            (t, geom, normal), (own_t, own_geom, own_normal) = answers = [
+                [wp.full((3, n), -7, dtype=kind) for kind in (wp.float32, wp.int32, wp.vec3)] for _ in range(2)]
+            warp_mujoco.rays(theirs, state, *rays[:2], warp_mujoco._src.types.vec6f(*groups), *rays[3:], *answers[0])
+            own.rays(*rays, *answers[1])
+            same = geom.numpy() == own_geom.numpy()
+            flat = same & ~np.isin(np.append(model.geom_type, 0), (2, 3, 4, 5))[geom.numpy()]
+            assert np.count_nonzero(~same) <= 3 and same.any() and (geom.numpy() == -1).any()
+            assert np.allclose(t.numpy()[flat], own_t.numpy()[flat], rtol=1e-5, atol=1e-5)
+            assert np.count_nonzero(np.abs(normal.numpy() - own_normal.numpy())[flat].max(axis=1) > 1e-4) <= 1  # edges have two
+        with refused("bodyexclude", "300"):
+            own.rays(*rays[:4], wp.zeros(n, dtype=wp.float32), *answers[1])
+        with refused("dist", "(3, 300)"):
+            own.rays(*rays, wp.zeros((1, n), dtype=wp.float32), *answers[1][1:])
+
+
+def test_planes_that_fit_in_no_mask() -> None:
+    xml = "".join(f'<geom type="plane" size="0 0 1" pos="0 0 {-i}" euler="{180 * (i % 2)} 0 0"/>' for i in range(33))
+    with pytest.warns(UserWarning, match="geom 31 '', geom 32"):
+        own = from_mujoco(make(f"<mujoco><worldbody>{xml}</worldbody></mujoco>")[0], device="cpu")
+    geom = np.empty(1, np.int32)
+    assert own.ray((0.0, 0.0, -28.5), (0.0, 0.0, -1.0), geomid=geom) == 1.5 and geom[0] == 30
+    assert own.ray((0.0, 0.0, -28.5), (0.0, 0.0, 1.0), geomid=geom) == 1.5 and geom[0] == 27
 
 
 def test_what_is_refused(scene: Any) -> None:
