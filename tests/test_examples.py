@@ -1,5 +1,6 @@
 """The programs of docs/examples.md run, are short, and find what they claim; a DataLoader's workers query a pickled structure."""
 
+import linecache
 import re
 from typing import Any
 
@@ -18,6 +19,7 @@ def executed(title: str) -> dict[str, Any]:
     if "import torch" in PROGRAMS[title]:
         pytest.importorskip("torch", reason="torch is not installed")
     names: dict[str, Any] = {}
+    linecache.cache[title] = len(PROGRAMS[title]), None, PROGRAMS[title].splitlines(True), title  # Warp reads the text of kernels
     exec(compile(PROGRAMS[title], title, "exec"), names)
     return names
 
@@ -51,6 +53,18 @@ def test_each_environment_sees_its_own_ball() -> None:
     assert depth.shape == (4096, 16, 16)
     top = 6.0 - height - 0.5  # depth of the highest point of each ball
     assert (depth.min(axis=(1, 2)) > top - 1e-3).all() and np.median(depth.min(axis=(1, 2)) - top) < 0.1
+
+
+def test_cameras_of_a_graph_see_the_balls_where_they_are() -> None:
+    names = executed("Depth cameras in a captured graph")
+    images, seen, count = names["images"], names["images"].object.numpy() == 1, names["count"]
+    depth = images.depth.numpy()
+    assert seen.any(axis=(1, 2)).all() and np.allclose(depth[~seen], 4.0, atol=1e-5)
+    assert (np.abs(depth.min(axis=(1, 2)) - 2.7) < 0.02).all()
+    place = names["bodies"].numpy()[:, :2] * (1.0, -1.0) / 3.0 * 40.0 + (31.5, 23.5)  # the pixel of each ball's centre
+    rows, columns = np.round(place[:, 1]).astype(int), np.round(place[:, 0]).astype(int)
+    assert seen[np.arange(count), rows, columns].all()
+    assert np.allclose(names["phase"].numpy(), np.linspace(0.0, 6.28, count) + 1.1, atol=1e-4)
 
 
 def test_the_depth_camera_measures_a_torus() -> None:

@@ -134,6 +134,8 @@ def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
     world = wp.array(ids, dtype=wp.int32, device="cuda:0")
     out, of_worlds, t = bvh8.closest_hit(*rays), worlds.closest_hit(*rays, world=world), wp.full(N, 5.0, dtype=float, device="cuda:0")
     moved = wrt.build(wrt.Scene.of([ball] * 3), movable=True, device="cuda:0").closest_hit(*rays)
+    camera = wrt.sensors.pinhole(np.diag([4.0, 4.0, 1.0]), (4, 4))
+    images = camera.trace(in_place, poses[:2], out=("depth", "object"))
     calls = {
         'wrt.build(geometry, "bvh2", builder="lbvh")': lambda: wrt.build(mesh, "bvh2", builder="lbvh", device="cuda:0"),
         "wrt.build(mesh)": lambda: wrt.build(ball, device="cuda:0"),
@@ -153,6 +155,7 @@ def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
         "hits.point": lambda: out.point,
         "hits.instance, hits.object": lambda: moved.instance,
         "hits.object over worlds": lambda: of_worlds.object,
+        "sensor.trace(worlds, poses, out=images)": lambda: camera.trace(in_place, poses[:2], out=images),
     }
     found = {}
     for name, call in calls.items():

@@ -106,8 +106,8 @@ def test_a_refit_and_a_query_are_captured_and_follow_the_points(name: str, monke
         assert (expected.prim_id >= 0).any()
 
 
-def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eagerly and in a graph: no copy, no allocation, no wait. The graph's hits are those of a structure on the CPU."""
+def test_a_step_of_moves_a_query_and_cameras_stays_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eagerly and in a graph: no copy, no allocation, no wait. The graph's hits and images are those of a structure on the CPU."""
     scenes = [[(icosphere(1), 3)], [(icosphere(2), 2), (icosphere(1), 4)]]
     worlds = [wrt.Scene(tuple(wrt.Object(mesh, (wrt.Material(),)) for mesh, n in each for _ in range(n))) for each in scenes]
     accel, rng = wrt.build(worlds, device="cuda:0"), np.random.default_rng(2)
@@ -117,10 +117,15 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
     some = wp.zeros(2, dtype=wp.mat44f, device="cuda:0")
     out, hidden = accel.closest_hit(*rays, world=world), accel.any_hit(*rays, world=world)
     seen = wp.zeros(500, dtype=float, device="cuda:0")
+    camera = wrt.sensors.pinhole([[8.0, 0.0, 5.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]], (12, 8))
+    views = wp.zeros(2, dtype=wp.transformf, device="cuda:0")
+    pictures = "t", "prim_id", "depth", "range", "object", "face", "point", "normal", "world", "direction"
+    images = camera.trace(accel, views, out=pictures)
 
     def step() -> Hits:
         accel.move(poses)
         accel.move(bodies, some)
+        camera.trace(accel, views, out=images)
         hits = accel.closest_hit(*rays, world=world, out=out)
         accel.any_hit(*rays, t_max=out.t, world=world, out=hidden)
         wp.launch(use, 500, [out.t, out.prim_id, hidden, seen], device="cuda:0")
@@ -135,16 +140,17 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
     step()
     with wp.ScopedCapture("cuda:0") as capture:
         hits = step()
-    assert (counts.copies, counts.synchronisations, counts.launches.total(), allocated) == (copies, waits, launches + 7, [])
+    assert (counts.copies, counts.synchronisations, counts.launches.total(), allocated) == (copies, waits, launches + 9, [])
     monkeypatch.undo()
     for _ in range(2):
         quaternions, matrices = rng.normal(size=(9, 4)), np.tile(np.eye(4), (2, 1, 1)) + 0.2 * rng.normal(size=(2, 4, 4))
         matrices[:, 3] = [0.0, 0.0, 0.0, 1.0]
         poses.assign(np.concatenate([0.5 * rng.normal(size=(9, 3)), quaternions], axis=1))
         some.assign(matrices)
+        views.assign([[0.1, 0.2, -5.0, 0.1, -0.1, 0.05, 0.9], [0.0, 0.3, -4.0, 0.0, 0.1, 0.1, 1.0]])
         before, copies, launches = seen.numpy(), counts.copies.copy(), counts.launches.total()
         wp.capture_launch(capture.graph)
-        assert counts.copies == copies and counts.launches.total() == launches + 7
+        assert counts.copies == copies and counts.launches.total() == launches + 9
         expected = wrt.build(worlds, device="cpu")
         expected.move(wp.array(poses.numpy(), dtype=wp.transformf, device="cpu"))
         expected.move(bodies.to("cpu"), some.to("cpu"))
@@ -154,6 +160,10 @@ def test_a_step_of_moves_and_a_query_stays_on_the_gpu(monkeypatch: pytest.Monkey
             assert getattr(out, name).numpy().tobytes() == getattr(found, name).tobytes()
         assert np.array_equal(seen.numpy(), before + np.where(found.t < np.inf, found.t + found.prim_id.astype(np.float32), np.float32(-1)))
         assert hits.instance.numpy().tobytes() == found.instance.tobytes() and hits.point.numpy().tobytes() == found.point.tobytes()
+        shown = camera.trace(expected, wp.array(views.numpy(), dtype=wp.transformf, device="cpu"), out=pictures)
+        assert (shown.object.numpy() >= 0).sum() > 20
+        for name in pictures:
+            assert getattr(images, name).numpy().tobytes() == getattr(shown, name).numpy().tobytes(), name
         assert np.array_equal(accel.geometry.to_world, expected.geometry.to_world)
     with pytest.raises(InputError, match="must be on cuda:0"):
         accel.move(bodies.to("cpu"), some.to("cpu"))

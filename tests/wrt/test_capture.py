@@ -50,6 +50,7 @@ class Things:
         self.sensor = wrt.sensors.pinhole(K, (8, 8), POSE)
         self.seen = self.accel.closest_hit(*(wp.array(each, dtype=wp.vec3, device=DEVICE)
                                              for each in (self.sensor.origins, self.sensor.directions)))
+        self.images = self.sensor.trace(self.accel, wp.array(POSE[None], dtype=wp.mat44, device=DEVICE), out=("depth", "object", "point"))
         self.pixels = wp.array(np.ones((3, 2)), dtype=wp.vec2d, device=DEVICE)
         self.points = wp.array(np.ones((3, 3)), dtype=wp.vec3, device=DEVICE)
         self.pose = wp.array(POSE[None], dtype=wp.mat44, device=DEVICE)
@@ -110,6 +111,7 @@ METHODS: dict[str, Call] = {
     "Sensor.depth": lambda s: s.sensor.depth(s.seen),
     "Sensor.range": lambda s: s.sensor.range(s.seen),
     "Sensor.points": lambda s: s.sensor.points(s.seen),
+    "Sensor.trace": lambda s: s.sensor.trace(s.accel, s.pose, out=s.images),
     "sensors.pinhole": lambda s: wrt.sensors.pinhole(K, (8, 8), s.pose),
     "sensors.fisheye": lambda s: wrt.sensors.fisheye(K, (8, 8), s.pose),
     "sensors.lidar": lambda s: wrt.sensors.lidar("os1-32", s.pose),
@@ -144,13 +146,14 @@ AT_ONCE |= {f"{kind}.{name}" for kind, names in {
     "OneMesh": "built build_all can_refit data geometry origin restore stats stream tree world",
     "Instances": "bodies data geometry invalid_moves masks name origin restore stats world",
     "Hits": "counters each in_shape shape source warp",
-    "Sensor": "picture rays",
-    "sensors": "LIDARS LidarModel Sensor"}.items() for name in names.split()}
+    "Sensor": "axis directions like origins picture rays",
+    "sensors": "Images LIDARS LidarModel Sensor"}.items() for name in names.split()}
 # On a GPU: arrays of the host in and out; a structure on the CPU; copies of arrays with gaps, which a virtual GPU does not capture.
 NOT_ON_GPU = {"camera_rays", "an adapter", "broadcast", "gaps"}
 RECORDED = {"OneMesh.any_hit", "OneMesh.closest_hit", "Instances.any_hit", "Instances.closest_hit", "Hits.point", "Hits.points",
             "Hits.point_error", "Hits.normal", "Hits.normals", "Hits.shading_normal", "Hits.uv", "Hits.face", "Hits.object",
-            "Hits.instance", "Hits.material", "refit of Warp arrays"}
+            "Hits.instance", "Hits.material", "Sensor.points", "Sensor.trace",
+            "refit of Warp arrays"}
 if DEVICE.is_cuda:
     RECORDED |= {"visible", "OneMesh.snapshot", "Instances.snapshot"}
 

@@ -6,8 +6,9 @@
 """
 
 from wrt.sensors.cameras import fisheye, pinhole, project, unproject
+from wrt.sensors.images import Images
 from wrt.sensors.lidars import LIDARS, LidarModel, lidar, raster_lidar, rotating_lidar, with_range_noise
 from wrt.sensors.sensor import Sensor
 
-__all__ = ["LIDARS", "LidarModel", "Sensor", "fisheye", "lidar", "pinhole", "project", "raster_lidar", "rotating_lidar", "unproject",
-           "with_range_noise"]
+__all__ = ["LIDARS", "Images", "LidarModel", "Sensor", "fisheye", "lidar", "pinhole", "project", "raster_lidar", "rotating_lidar",
+           "unproject", "with_range_noise"]

@@ -14,7 +14,7 @@ from wrt.core.arrays import given_like
 from wrt.core.checks import as_array, as_size, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
-from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
+from wrt.sensors.sensor import Frame, Sensor, as_doubles, make_sensor
 
 LENGTHS = 0, 4, 5, 8, 12  # Numbers of coefficients: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4.
 STEPS = 64  # Of the path from the centre to a point.
@@ -205,7 +205,7 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or the rays exceed the range of float32.
     """
-    return make_sensor(_picture(Radial(distortion), intrinsics, size), pose, 2, 0 if rolling else None, like)
+    return make_sensor(_picture(Radial(distortion), intrinsics, size), pose, 0 if rolling else None, like)
 
 
 def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
@@ -229,7 +229,7 @@ def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or a corner would show an angle above pi.
     """
-    return make_sensor(_picture(Fisheye(distortion), intrinsics, size), pose, 2, 0 if rolling else None, like)
+    return make_sensor(_picture(Fisheye(distortion), intrinsics, size), pose, 0 if rolling else None, like)
 
 
 def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = (), fisheye: bool = False) -> Any:
@@ -291,9 +291,17 @@ def _no_ray(lens: Lens, column: float, row: float) -> InputError:
                       hint="check the order of the coefficients, or fit fewer of them, or crop the picture")
 
 
-def _picture(lens: Lens, intrinsics: ArrayLike, size: tuple[int, int] | str) -> np.ndarray:
-    """Return the directions of all pixels: (rows, columns, 3), or (B, rows, columns, 3) for B intrinsics."""
+def _picture(lens: Lens, intrinsics: ArrayLike, size: tuple[int, int] | str) -> Frame:
+    """Make the frame of all pixels: (rows, columns), or (B, rows, columns) for B intrinsics."""
     ks, (width, height) = as_doubles(intrinsics, "intrinsics"), as_size(size)
+    many = ks.ndim == 3 and len(ks) > 0
+    each = [_intrinsics(k, i) for i, k in enumerate(ks)] if many else [_intrinsics(ks)]
+    if isinstance(lens, Radial) and not lens.coefficients.any():
+        across, down = np.zeros((len(each), width, 2)), np.ones((len(each), height, 4))
+        for i, k in enumerate(each):
+            y = (np.arange(height) - k[1, 2]) / k[1, 1]
+            across[i, :, 0], down[i, :, 2], down[i, :, 3] = (np.arange(width) - k[0, 2]) / k[0, 0], -k[0, 1] * y / k[0, 0], y
+        return Frame(2, across=across if many else across[0], down=down if many else down[0])
     columns, rows = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
 
     def of_one(k: np.ndarray) -> np.ndarray:
@@ -302,9 +310,7 @@ def _picture(lens: Lens, intrinsics: ArrayLike, size: tuple[int, int] | str) -> 
             raise _no_ray(lens, *np.argwhere(~exists)[0][::-1])
         return directions
 
-    if ks.ndim != 3 or not len(ks):
-        return of_one(_intrinsics(ks))
-    return np.stack([of_one(_intrinsics(k, i)) for i, k in enumerate(ks)])
+    return Frame(2, np.stack([of_one(k) for k in each]) if many else of_one(each[0]))
 
 
 def _intrinsics(value: ArrayLike, index: int | None = None) -> np.ndarray:

@@ -12,7 +12,7 @@ from wrt.core.checks import as_array, as_integer, as_size, require_known, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
 from wrt.scene.values import as_number
-from wrt.sensors.sensor import Sensor, as_doubles, make_sensor
+from wrt.sensors.sensor import Frame, Sensor, as_doubles, make_sensor
 
 TURN = 2.0 * np.pi
 
@@ -109,7 +109,7 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
                          hint="np.radians converts degrees")
     steps = as_integer(steps, "steps", 1, 1 << 24)
     azimuths = as_number(start, "start") + as_number(turn, "turn") * np.arange(steps) / steps
-    return make_sensor(_spherical(azimuths[None, :], rows[:, None]), pose, 0, 1 if rolling else None, like)
+    return make_sensor(_spherical(azimuths, rows), pose, 1 if rolling else None, like)
 
 
 def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: ArrayLike | None = None, rolling: bool = False,
@@ -147,13 +147,14 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
         raise InputError(f"must be at most 2 pi across and pi up, got {across:g} and {up:g}", argument="fov")
     azimuths, elevations = (0.5 * angle * np.linspace(1.0, -1.0, n) if n > 1 else np.zeros(1)
                             for angle, n in ((across, width), (up, height)))
-    return make_sensor(_spherical(azimuths[None, :], elevations[:, None]), pose, 0, 0 if rolling else None, like)
+    return make_sensor(_spherical(azimuths, elevations), pose, 0 if rolling else None, like)
 
 
-def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Return unit vectors (rows, columns, 3) in a frame with x forward, y left, z up. Angles are in radians."""
-    level = np.cos(elevation)
-    return np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=-1)
+def _spherical(azimuths: np.ndarray, elevations: np.ndarray) -> Frame:
+    """Make the frame of unit vectors with x forward, y left, z up. Angles are in radians, of columns and rows."""
+    none = np.full(len(elevations), -0.0)  # x - 0.0 has the sign of x, also for 0
+    return Frame(0, across=np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1),
+                 down=np.stack([np.cos(elevations), np.sin(elevations), none, none], axis=-1))
 
 
 def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> Any:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, Generic, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Generic, Protocol
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,11 @@ from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
 from wrt.core.types import ArrayLike, ArrayT
-from wrt.scene.values import type_of
+from wrt.scene.values import as_number, type_of
+from wrt.sensors.images import Images
+
+if TYPE_CHECKING:
+    from wrt.accel.queries.accelerator import Accelerator
 
 MAX_ROTATION_ERROR = 1e-5  # largest entry of |R R^T - I| for the rotation matrix R of a pose
 RAYS_PER_JOB = 1 << 16
@@ -33,26 +38,141 @@ class FoundHits(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor(Generic[ArrayT]):
-    """Rays of a sensor, one per pixel, and the shape of its images. It keeps the arrays that it is given.
+class Frame:
+    """Directions of a sensor's pixels in its own frame, float64: of one sensor, or of F sensors, in a first axis.
 
-    Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device.
-
-    Parameters
-    ----------
-    origins, directions
-        (N, 3) float32 each, or Warp arrays (N,) of vec3, in world space: one image row after another, one image after another. Origins
-        farther than 1,024 from 0 are float64 (vec3d), if float32 would round them.
-    shape
-        (rows, columns) of an image, or (B, rows, columns) for B poses; N is the product.
-    axis
-        Unit vector in world space along which `depth` measures, float64: (3,), or an array that broadcasts with (*shape, 3).
+    Either all `directions` (..., rows, columns, 3), or the numbers from which a sum and a product make each: `across` (..., columns, 2) and
+    `down` (..., rows, 4), as in kernels.shade.sensors.Sensors.
     """
 
-    origins: ArrayT
-    directions: ArrayT
+    axis: int  # of the frame, along which depth is measured
+    directions: np.ndarray | None = None
+    across: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    down: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, columns), or (F, rows, columns)."""
+        return (*self.down.shape[:-1], self.across.shape[-2]) if self.directions is None else self.directions.shape[:-1]
+
+    def local(self) -> np.ndarray:
+        """Return the directions of all pixels, (*shape, 3)."""
+        if self.directions is not None:
+            return self.directions
+        c, r = self.across[..., None, :, :], self.down[..., :, None, :]
+        return np.stack(np.broadcast_arrays(r[..., 0] * c[..., 0] + r[..., 2], r[..., 0] * c[..., 1] + r[..., 3], r[..., 1]), axis=-1)
+
+    def largest(self) -> float:
+        """Return a bound on the absolute values of the directions; NaN if one is NaN."""
+        parts = (self.directions,) if self.directions is not None else (self.across, self.down)
+        return float(np.prod([max(np.abs(part).max(), 1.0) for part in parts]))
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor(Generic[ArrayT]):
+    """A sensor at one pose or at many: `trace` makes its rays where it traces them; `origins` and `directions` are its rays as arrays.
+
+    Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device. `pinhole`, `fisheye` and the LiDARs
+    make sensors.
+
+    Attributes
+    ----------
+    frame : Frame
+        Directions in the sensor's frame.
+    poses : (..., 4, 4) float64
+        Sensor to world: one, or one for each image, row or column.
+    rolling : int or None
+        Axis of an image, 0 or 1, along which each row or column has its own pose.
+    shape : tuple
+        (rows, columns) of an image, or (B, rows, columns) for B poses; N is the product.
+    like : object
+        Array of the library and device that the rays have.
+    """
+
+    frame: Frame
+    poses: np.ndarray
+    rolling: int | None
     shape: tuple[int, ...]
-    axis: np.ndarray
+    like: object = None
+    on_devices: dict[str, Any] = field(default_factory=dict, repr=False)  # Frame and poses on devices, which calls of `trace` share.
+
+    @property
+    def origins(self) -> ArrayT:
+        """Origins of the rays in world space, (N, 3) float32, or a Warp array (N,) of vec3: one image row after another, one image after
+        another. Origins farther than 1,024 from 0 are float64 (vec3d), if float32 would round them."""
+        return self._made[0]
+
+    @property
+    def directions(self) -> ArrayT:
+        """Directions of the rays, as `origins`; always float32."""
+        return self._made[1]
+
+    @cached_property
+    def _made(self) -> tuple[Any, Any]:
+        return make_rays(self)
+
+    @cached_property
+    def axis(self) -> np.ndarray:
+        """Unit vector in world space along which `depth` measures, float64: (3,), or an array that broadcasts with (*shape, 3)."""
+        axes = self.poses[..., :3, self.frame.axis]  # (..., 3) or (..., rows or columns, 3)
+        if self.rolling is not None:
+            axes = np.expand_dims(axes, axes.ndim - 1 - self.rolling)
+        elif axes.ndim > 1 or len(self.shape) > 2:
+            axes = axes[..., None, None, :]
+        return axes
+
+    def trace(self, accel: Accelerator, poses: ArrayLike | None = None, out: Images | str | Sequence[str] = "depth",
+              world: ArrayLike | None = None, t_max: float = np.inf, threads: int | None = None) -> Images:
+        """Trace the sensor's rays, which are made in the query, and return pictures of their hits.
+
+        Hits are those of `closest_hit` for the rays (`out=("origin", "direction")` shows them), to the last bit. No ray is stored. If
+        poses and `world` are Warp arrays and `out` is Images, the call copies nothing to or from the host and allocates nothing, and a
+        CUDA graph can capture it (docs/sensors.md).
+
+        Parameters
+        ----------
+        accel : Accelerator
+            Structure over meshes, instances or worlds.
+        poses : Warp array or tensor on the structure's device, or array_like of (B, 4, 4)
+            Sensor to world, in place of the sensor's own poses: B of wp.transformf or mat44f, or rows (B, 7) of position and quaternion,
+            (B, 3, 4) or (B, 4, 4); with a rolling sensor, (rows or columns,) or (B, rows or columns) of them. Values of Warp arrays are
+            not checked: at a pose that is not finite, rays miss.
+        out : Images, str or sequence of str
+            `Images` with the arrays to fill, or the names of the images to make.
+        world : int or array of int32, optional
+            World of each image, or of each pose of a rolling sensor. Without it, image i sees world i, or pose i, if there are as many as
+            worlds. Values of Warp arrays are not checked: in a world that does not exist, rays miss.
+        t_max : float
+            End of the rays, in units of the direction's length.
+        threads : int, optional
+            Threads on the CPU; one per core by default.
+
+        Returns
+        -------
+        Images
+            `out`, or new images of the shape (B, rows, columns), or (rows, columns) for a single pose that is not in an array.
+
+        Raises
+        ------
+        InputError
+            Names the argument and what was expected.
+        """
+        from wrt.accel.queries.images import trace_sensor  # not at the top: the arrays of rays need no structure
+
+        if is_tensor(poses):
+            poses = to_warp(from_tensor(poses, "poses", None))
+        elif poses is not None and not isinstance(poses, wp.array):
+            poses = as_poses(poses)
+        if t_max != np.inf:
+            t_max = as_number(t_max, "t_max", low=0.0)
+        names = [each.name for each in fields(Images)]
+        wanted: dict[str, Any] = vars(out) if isinstance(out, Images) else dict.fromkeys([out] if isinstance(out, str) else out)
+        if unknown := [name for name in wanted if name not in names]:
+            raise InputError(f"must be Images, or some of {', '.join(names)}, got {shown(unknown[0])}", argument="out")
+        if isinstance(out, Images):
+            wanted = {name: array for name, array in wanted.items() if array is not None}
+        images = trace_sensor(accel, self, poses, wanted, world, t_max, threads)
+        return out if isinstance(out, Images) else Images(**images)
 
     @property
     def rays(self) -> tuple[Any, Any]:
@@ -132,34 +252,41 @@ class Sensor(Generic[ArrayT]):
         return given_like(hits.t, scaled.astype(np.float32))
 
 
-def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: int | None, like: object) -> Sensor[Any]:
-    """Make a sensor from directions in its own frame, float64: (rows, columns, 3), or (B, rows, columns, 3) for B different sensors.
+def make_sensor(frame: Frame, pose: ArrayLike | None, rolling: int | None, like: object) -> Sensor[Any]:
+    """Make a sensor of a frame.
 
     - pose: (4, 4) or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4); or OpenCV's pair (R, t).
-    - axis: index of the frame's axis that measures depth. like: array of the library and device that the rays get; None: `pose`.
-    - rolling: axis of `local`, 0 or 1, along which each row or column has its own pose; None: all pixels of an image share a pose.
+    - like: array of the library and device that the rays get; None: `pose`.
+    - rolling: axis of an image, 0 or 1, along which each row or column has its own pose; None: all pixels of an image share a pose.
 
     Raises InputError that names the argument and what was expected.
     """
-    poses, size = as_poses(pose), local.shape[-3:]
+    poses, size = as_poses(pose), frame.shape[-2:]
     many, own = poses.shape[:-2], () if rolling is None else (size[rolling],)
     if len(many) > 1 + len(own) or many[len(many) - len(own):] != own:
         line = ", ".join(map(str, (*own, 4, 4)))
         raise InputError(f"must be ({line}) or (B, {line}), got {poses.shape}", argument="pose")
-    batch = many[:len(many) - len(own)]
-    limit = np.finfo(np.float32).max
-    if not (max(local.max(), -local.min()) <= limit / 2.0 and np.abs(poses[..., :3, 3]).max() <= limit):  # rotated by at most sqrt(3)
+    limit = float(np.finfo(np.float32).max)
+    if not (frame.largest() <= limit / 2.0 and np.abs(poses[..., :3, 3]).max() <= limit):  # rotated by at most sqrt(3)
         raise InputError("rays of this sensor and pose exceed the range of float32")
+    batch = many[:len(many) - len(own)]
     try:
-        batch = np.broadcast_shapes(batch, local.shape[:-3])
+        batch = np.broadcast_shapes(batch, frame.shape[:-2])
     except ValueError:
-        raise InputError(f"and pose must be of equally many cameras, or of one: got {len(local)} intrinsics and {batch[0]} poses",
+        raise InputError(f"and pose must be of equally many cameras, or of one: got {frame.shape[0]} intrinsics and {batch[0]} poses",
                          argument="intrinsics") from None
-    shape = (*batch, *size[:2])
+    return Sensor(frame, poses.copy(), rolling, (*batch, *size), (pose[0] if isinstance(pose, tuple) else pose) if like is None else like)
+
+
+def make_rays(sensor: Sensor[Any]) -> tuple[Any, Any]:
+    """Return all origins and directions of a sensor."""
+    poses, local, shape, rolling = sensor.poses, sensor.frame.local(), sensor.shape, sensor.rolling
+    batch, size = shape[:-2], (*shape[-2:], 3)
+    own = () if rolling is None else (size[rolling],)
     images = int(np.prod(batch))
     origins, directions = (empty_aligned((images, *size), kind) for kind in (type_of(poses[..., :3, 3]), np.float32))
     each = np.broadcast_to(poses, (*batch, *own, 4, 4)).reshape(images, *own, 4, 4)
-    frame_rays = np.broadcast_to(local, (images, *size))
+    frame_rays = np.broadcast_to(local, (*batch, *size)).reshape(images, *size)
 
     def fill(parts: list[tuple[int, slice]]) -> None:
         for i, rows in parts:
@@ -172,14 +299,7 @@ def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: i
     parts = [(i, slice(row, row + height)) for i in range(images) for row in range(0, size[0], height)]
     step = max(1, RAYS_PER_JOB // (min(height, size[0]) * size[1]))
     run_all([partial(fill, parts[first:first + step]) for first in range(0, len(parts), step)], thread_count(None))
-    axes = each[..., :3, axis]  # (images, 3) or (images, rows or columns, 3)
-    if rolling is not None:
-        axes = np.expand_dims(axes, 2 - rolling)
-    elif batch:
-        axes = axes[:, None, None]
-    axes = axes.reshape(*batch, *axes.shape[1:]).copy()
-    like = (pose[0] if isinstance(pose, tuple) else pose) if like is None else like
-    return Sensor(_of_library(origins.reshape(-1, 3), like), _of_library(directions.reshape(-1, 3), like), shape, axes)
+    return _of_library(origins.reshape(-1, 3), sensor.like), _of_library(directions.reshape(-1, 3), sensor.like)
 
 
 def _turned(local: np.ndarray, rotation: np.ndarray, rolling: int | None) -> np.ndarray:

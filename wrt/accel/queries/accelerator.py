@@ -231,6 +231,13 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
     return Query(valid, arrays, threads, worlds, width), shape, give
 
 
+def present(accel: Accelerator) -> Snapshot:
+    """Return the snapshot of a structure, also in a capture. Raises InputError if `accel` is none."""
+    if not isinstance(accel, Accelerator):
+        raise InputError(f"must be a structure, got {shown(accel)}", argument="accel", hint="build one first: accel = wrt.build(mesh)")
+    return accel._snapshot
+
+
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     """Return the snapshot of a structure over one mesh without spheres, or, if `instances`, over instances or worlds.
     Raises InputError for any other structure."""
