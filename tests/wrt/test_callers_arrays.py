@@ -289,7 +289,7 @@ NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kerne
              "Scene.save", "Scene.bounds", "Scene.camera", "Scene.outlines", "Scene.with_settings", "Camera.lens", "Camera.opened",
              "Camera.record", "Camera.switches", "Mesh.reach", "Mesh.warn_if_far", "OneMesh.restore", "Instances.restore"}
 """Public names without an argument that holds arrays, or whose argument is an object of another row: a scene, a camera, a structure."""
-KEEP = {"Film", "sensors.Sensor", "sensors.LidarModel"}
+KEEP = {"Film", "sensors.Images", "sensors.Sensor", "sensors.LidarModel"}
 """Records of results, whose docstrings say that they keep the arrays that they are given."""
 
 

@@ -6,7 +6,8 @@ from typing import Any
 
 @dataclass(eq=False)
 class Images:
-    """Images that `Sensor.trace` fills: Warp arrays of the images' shape on the structure's device, or None if not wanted.
+    """Images that `Sensor.trace` fills. It keeps the arrays that it is given: Warp arrays of the images' shape, or None if not wanted,
+    on the structure's device.
 
     Attributes
     ----------
