@@ -73,7 +73,7 @@ class Sensor(Generic[ArrayT]):
     """A sensor at one pose or at many: `trace` makes its rays where it traces them; `origins` and `directions` are its rays as arrays.
 
     Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device. `pinhole`, `fisheye` and the LiDARs
-    make sensors.
+    make sensors. The class keeps the arrays that it is given.
 
     Attributes
     ----------
