@@ -163,8 +163,9 @@ def refuse_capture(device: Device | None = None) -> None:
         if str(frame.f_globals.get("__name__")).startswith("wrt.") and "<" not in frame.f_code.co_qualname:
             name = frame.f_code.co_qualname
         frame = frame.f_back
-    raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture, or pass contiguous Warp"
-                     " arrays to what docs/moving.md lists; a kernel of your own with wrt.ray_query can be captured, too")
+    raise InputError(f"{name} cannot be captured in a graph",
+                     hint="call it before or after the capture (properties of hits: once before), or pass contiguous Warp arrays to what"
+                     " docs/moving.md lists; a kernel of your own with wrt.ray_query can be captured, too")
 
 
 # --- kernels and their files ------------------------------------------------------------------------------------------
