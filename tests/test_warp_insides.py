@@ -21,8 +21,8 @@ UNDOCUMENTED = {"adj", "codegen", "ctype", "execs", "get_kernel_hooks", "get_mod
                 "hashers", "hooks", "launch_bounds_t", "native_func", "params", "params_addr", "runtime", "array_t", "vars"}
 # Names with an underscore that files may use although the project does not define them, and their owners.
 OF_OTHERS = {"_digest": "a row of bench error",
-             "_replace": "NamedTuple", "_asdict": "NamedTuple", "_fields": "NamedTuple", "_exit": "os", "_getframe": "sys",
-             "_run_exitfuncs": "atexit", "_obj": "ctypes.byref"}
+             "_version": "torch.Tensor", "_replace": "NamedTuple", "_asdict": "NamedTuple", "_fields": "NamedTuple",
+             "_exit": "os", "_getframe": "sys", "_run_exitfuncs": "atexit", "_obj": "ctypes.byref"}
 CLICK = {"wrt/cli/common.py", "wrt/cli/reporting.py", "wrt/cli/measure.py"}  # files that use `params` of click's commands
 TEXTS = re.compile(r"\b_?wp_|WP_[A-Z]|Warp CUDA|NVIDIA CUDA")
 # Words of Warp's C++ that the native code of kernels/ may use.
