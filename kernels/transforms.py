@@ -12,6 +12,7 @@ class Transforms:
     floats: wp.array(dtype=wp.float32)
     doubles: wp.array(dtype=wp.float64)
     size: int
+    own: bool  # The present matrices of all instances, whose boxes alone change.
     outside: bool  # Maps between the caller's mesh and world, whose origins differ from the part's and the structure's.
 
 

@@ -11,6 +11,7 @@ from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.units.box import PAD_COORDINATE
 from wrt.kernels.wide.layout import WIDTH
 
+LARGEST = 1e300  # Bound of the corners of parts' boxes: the box of all space is infinite.
 SMALLEST = wp.constant(wp.float64(1e-45))  # Moves a float64 near 0 by a float32.
 
 
@@ -157,7 +158,7 @@ def place(top: TopLevel, ids: wp.array(dtype=wp.int32), transforms: Transforms, 
         return
     at = top.place[row]
     part = top.placements[at].bottom
-    map = affine_of(transforms, i)
+    map = affine_of(transforms, wp.where(transforms.own, row, i))
     if transforms.outside:
         map.t = map.t + (times(map.a, top.own_origin[part]) - top.origin)
     inverse = inverted(map.a)
@@ -165,7 +166,9 @@ def place(top: TopLevel, ids: wp.array(dtype=wp.int32), transforms: Transforms, 
     box = Box()
     box.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
     box.hi = -box.lo
-    if wp.isfinite(map.t) and spread <= top.most_spread:
+    if transforms.own:
+        top.reach = wp.inf
+    if wp.where(transforms.own, top.invalid[ids[i]] == 0, wp.isfinite(map.t) and spread <= top.most_spread):
         box = world_box(top, part, map)
     top.slack[row] = 0.0
     if box.valid:
@@ -184,6 +187,21 @@ def place(top: TopLevel, ids: wp.array(dtype=wp.int32), transforms: Transforms, 
         slot = top.slot[row]
         while slot >= 0 and add(top.pending, slot / 2, 1) == 0:
             slot = top.up[slot / 2]
+
+
+@kernel
+def measure(top: TopLevel, part: int, step: int, order: wp.array(dtype=int), low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3)):
+    """Write the boxes of a refitted part around `step` primitives each, as wrt.accel.top_level.part_boxes, with one thread per box."""
+    i = wp.tid()
+    lo, hi = wp.vec3(wp.inf, wp.inf, wp.inf), wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    for j in range(i * step, wp.min((i + 1) * step, order.shape[0])):
+        prim = wp.where(step == 1, j, order[j])
+        lo = wp.min(lo, low[prim])
+        hi = wp.max(hi, high[prim])
+    most = wp.float64(wp.static(LARGEST)) * wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
+    least, largest = wp.max(wp.vec3d(lo), -most), wp.min(wp.vec3d(hi), most)
+    top.center[top.first_box[part] + i] = wp.float64(0.5) * (least + largest)
+    top.half[top.first_box[part] + i] = wp.float64(0.5) * (largest - least)
 
 
 @kernel
@@ -215,7 +233,7 @@ def fit(top: TopLevel, ids: wp.array(dtype=wp.int32), first: int):
             at = top.wide_node[node]
             if at >= 0 and lo[0] <= hi[0]:
                 for k in range(3):
-                    top.wide[at + k] = lo[k]
-                    top.wide[at + 3 + k] = hi[k]
+                    top.wide[at + k] = wp.max(lo[k], -3e38)  # finite: an infinite widening would give NaN
+                    top.wide[at + 3 + k] = wp.min(hi[k], 3e38)
                 top.wide[at + 6] = slack
         slot = top.up[node]

@@ -145,6 +145,7 @@ def test_the_page_says_what_each_call_costs_on_a_gpu() -> None:
         "bvh8.refit(points)": lambda: bvh8.refit(larger),
         "worlds.move(rows, matrices) of NumPy": lambda: worlds.move(np.arange(3), matrices),
         "worlds.move(poses)": lambda: in_place.move(poses),
+        "worlds.refit(0, points, world=0)": lambda: in_place.refit(0, larger, world=0),
         "closest_hit(o, d, out=hits)": lambda: bvh8.closest_hit(*rays, out=out),
         "closest_hit(o, d, t_min, t_max, out=hits)": lambda: bvh8.closest_hit(*rays, 0.25, 7.0, out=out),
         "closest_hit(o, d, t_max=t, world=ids, out=hits)": lambda: in_place.closest_hit(*rays, t_max=t, world=world, out=of_worlds),

@@ -102,6 +102,7 @@ METHODS: dict[str, Call] = {
     "Instances.closest_hit": lambda s: s.instances.closest_hit(*s.warp),
     "Instances.any_hit": lambda s: s.instances.any_hit(*s.warp),
     "Instances.move": lambda s: s.instances.move(0, np.diag([2.0, 2.0, 2.0, 1.0])),
+    "Instances.refit": lambda s: s.instances.refit(0, s.larger),
     "Instances.snapshot": lambda s: s.instances.snapshot,
     **{f"Hits.{name}": partial(lambda s, name: getattr(s.hits_of_instances if name == "instance" else s.hits, name), name=name)
        for name in OF_HITS},

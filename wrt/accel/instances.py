@@ -16,7 +16,7 @@ from wrt.accel.moves import InstanceNames, ObjectId, check_ids, checked_moves, c
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.snapshot import AccelStats, Refit, Structure
-from wrt.accel.top_level import BOXES, MOVED_BOXES, TopLevel, build_top, part_boxes, plant
+from wrt.accel.top_level import BOXES, MOVED_BOXES, TopLevel, build_top, part_boxes, plant, set_boxes
 from wrt.core.arrays import check_no_gradients, from_tensor, is_tensor, to_warp
 from wrt.core.building import build_clock
 from wrt.core.device import upload
@@ -31,7 +31,7 @@ ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
 class InstanceArrays(Accelerator):
-    """What the caller's kernels read of a structure over instances, and what the caller writes."""
+    """Arrays of a structure over instances: what moves and refits in place write, and what the caller may read or write."""
 
     @property
     def world(self) -> WarpStruct:
@@ -56,6 +56,117 @@ class InstanceArrays(Accelerator):
             raise InputError("has no masks and bodies: some objects are no instances", argument="accel",
                              hint="wrt.build(scene, movable=True) makes each object an instance")
         return data.bodies, data.masks
+
+    def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float, filters: Any = None) -> None:
+        """Build the upper level, and set the snapshot. filters: values of `bodies` and `masks`; None for those at first."""
+        self._set_bottoms(bottoms)
+        wide = self.structure.accel.stream is not None and self.device.is_cpu
+        boxes = part_boxes(geometry, self.bottoms, max(BOXES // max(len(geometry.part), 1), 8))
+        self._top = build_top(geometry, boxes, self.device, self.threads, wide)
+        self._roots = upload(self._top.roots, wp.int32, self.device)
+        self._bodies, self._masks = filters_of(geometry, self.device, filters)
+        self._install_top(geometry, begin, self._top.cost)
+
+    def _set_bottoms(self, bottoms: list[OneMesh]) -> None:
+        self.bottoms = bottoms
+        # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
+        self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
+        self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)
+
+    def _install_top(self, geometry: InstancedGeometry, begin: float, built_cost: float) -> None:
+        """Set the snapshot over the upper level. begin, built_cost: see OneMesh._install."""
+        top, data = self._top, self.structure.struct()
+        nodes = data.nodes = top.data.nodes
+        data.placements, data.slack, data.bottoms = top.data.placements, top.data.node_slack, self._bottoms
+        if self._bodies is not None:
+            data.bodies, data.masks, data.ids = self._bodies, self._masks, upload(top.order, wp.int32, self.device)
+        if top.data.wide is not None:
+            data.wide, data.roots = top.data.wide, to_warp(np.arange(len(top.roots), dtype=np.int32))
+        stats = [each.stats for each in self._bottom_snapshots]
+        sizes = np.array([nodes.capacity, *(s.bytes for s in stats)], np.int64)
+        data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
+        total = AccelStats(
+            build_clock() - begin, len(nodes) + sum(s.nodes for s in stats), len(top.order) + sum(s.leaves for s in stats),
+            top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
+            array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
+        changes = isinstance(geometry, MovedGeometry) or any(each.changes for each in self._bottom_snapshots)
+        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots,
+                                 order=top.order, bodies=self._bodies, changes=changes)
+
+    @property
+    def invalid_moves(self) -> WarpArray:
+        """By the value of `hits.instance`, 1 if the last move in place was invalid, else 0: a Warp array of int32 on the device.
+
+        A matrix must be finite, must not flatten or shear too much, and must not lead farther than 1e18 from 0. After an invalid move no
+        ray hits the instance, until it moves again; its matrix in `geometry` stays.
+        """
+        with self._refitting:
+            return self._movable().data.invalid
+
+    def _movable(self) -> TopLevel:
+        """Return the upper level with what moves need, which is made by the first move."""
+        if "rows" not in self._cache:
+            geometry: Any = self._snapshot.geometry
+            rows = self._cache["rows"] = rows_of(geometry, self._snapshot.attributes)
+            self._cache["all"] = upload(np.flatnonzero(rows >= 0), wp.int32, self.device)
+            self._top = self._top.movable(rows, geometry, part_boxes(geometry, self.bottoms, MOVED_BOXES))
+        return self._top
+
+    def refit(self, object: ObjectId, vertices: ArrayLike, world: int | None = None) -> Refit:
+        """Refit the mesh of an object in place. All its instances follow, in all worlds. Hits are those of a new structure.
+
+        Parameters
+        ----------
+        object, world
+            One object, as for `move`.
+        vertices : Warp array (V,) of vec3
+            New vertices of the mesh, on the structure's device; if they are not finite, later moves in place of the mesh are invalid.
+
+        Returns
+        -------
+        Refit
+            That of `OneMesh.refit` with `in_place=True`, which says what graphs can capture.
+
+        Raises
+        ------
+        InputError
+            For other arrays, objects that cannot move, meshes far from 0, and structures of meshes that cannot be refitted in place.
+        """
+        with self._refitting:
+            begin, geometry = build_clock(), cast(Any, self._snapshot.geometry)
+            if not isinstance(geometry, MovedGeometry):
+                refuse_capture(self.device)
+            self._movable()
+            names = self._cache["names"] = self._cache.get("names") or InstanceNames(geometry, self._snapshot.attributes)
+            id, rows = names.find(object, world), self._cache["rows"]
+            if id.ndim or rows[id] < 0 or geometry.parts[geometry.part[rows[id]]].origin is not None:
+                raise InputError("must be one object with a matrix of its own, and with a mesh near 0", argument="object")
+            part = int(geometry.part[rows[id]])
+            before, bottom = self.bottoms[part].data, self.bottoms[part].__copy__()
+            bottom.refit(vertices, in_place=True)
+            if bottom.data is not before:
+                self._set_bottoms([*self.bottoms[:part], bottom, *self.bottoms[part + 1 :]])
+                geometry = replace(geometry.now(), parts=tuple(each.geometry for each in self.bottoms))
+                self._begin_in_place(geometry)
+                set_boxes(self._top.data, part_boxes(geometry, self.bottoms, MOVED_BOXES), self.device)
+                self._cache[f"part {part}"] = upload(np.flatnonzero((rows >= 0) & (geometry.part[rows] == part)), wp.int32, self.device)
+            elif not isinstance(geometry, MovedGeometry):
+                self._begin_in_place(geometry)
+            self._top.follow(ids := self._cache[f"part {part}"], part, cast(Any, bottom).fitted)
+            self._top.fit(ids)
+            return Refit(build_clock() - begin, float("nan"), False)
+
+    def _begin_in_place(self, geometry: InstancedGeometry) -> None:
+        """Give the structure arrays that no other snapshot shares."""
+        if self.device.is_capturing:
+            raise InputError("a graph cannot capture the first move in place, which allocates memory",
+                             hint="move in place once before the capture")
+        begin, cost = build_clock(), self._snapshot.built_cost
+        self._top = self._movable().copied()
+        data = self._top.data
+        data.to_world = upload(geometry.to_world.reshape(-1, 4).copy(), wp.vec4d, self.device)
+        data.origin = wp.vec3d(*shift(geometry.origin)[:3, 3])
+        self._install_top(MovedGeometry(geometry, data.to_world), begin, cost)
 
 
 def filters_of(geometry: InstancedGeometry, device: Device, given: Any = None) -> tuple[WarpArray | None, WarpArray | None]:
@@ -90,57 +201,6 @@ class Instances(InstanceArrays):
         Accelerator.__init__(self, Structure(type(bottoms[0]), units._replace(instances=True)), geometry, attributes, device, threads)
         self._place(bottoms, geometry, begin, filters)
         return self
-
-    def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float, filters: Any = None) -> None:
-        """Build the upper level, and set the snapshot. filters: values of `bodies` and `masks`; None for those at first."""
-        self.bottoms = bottoms
-        # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
-        self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
-        self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)
-        wide = self.structure.accel.stream is not None and self.device.is_cpu
-        boxes = part_boxes(geometry, self.bottoms, max(BOXES // max(len(geometry.part), 1), 8))
-        self._top = build_top(geometry, boxes, self.device, self.threads, wide)
-        self._roots = upload(self._top.roots, wp.int32, self.device)
-        self._bodies, self._masks = filters_of(geometry, self.device, filters)
-        self._install_top(geometry, begin, self._top.cost)
-
-    def _install_top(self, geometry: InstancedGeometry, begin: float, built_cost: float, changes: bool = False) -> None:
-        """Set the snapshot over the upper level. begin, built_cost: see OneMesh._install; changes: see Snapshot."""
-        top, data = self._top, self.structure.struct()
-        nodes = data.nodes = top.data.nodes
-        data.placements, data.slack, data.bottoms = top.data.placements, top.data.node_slack, self._bottoms
-        if self._bodies is not None:
-            data.bodies, data.masks, data.ids = self._bodies, self._masks, upload(top.order, wp.int32, self.device)
-        if top.data.wide is not None:
-            data.wide, data.roots = top.data.wide, to_warp(np.arange(len(top.roots), dtype=np.int32))
-        stats = [each.stats for each in self._bottom_snapshots]
-        sizes = np.array([nodes.capacity, *(s.bytes for s in stats)], np.int64)
-        data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
-        total = AccelStats(
-            build_clock() - begin, len(nodes) + sum(s.nodes for s in stats), len(top.order) + sum(s.leaves for s in stats),
-            top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
-            array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
-        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots,
-                                 order=top.order, bodies=self._bodies, changes=changes)
-
-    @property
-    def invalid_moves(self) -> WarpArray:
-        """By the value of `hits.instance`, 1 if the last move in place was invalid, else 0: a Warp array of int32 on the device.
-
-        A matrix must be finite, must not flatten or shear too much, and must not lead farther than 1e18 from 0. After an invalid move no
-        ray hits the instance, until it moves again; its matrix in `geometry` stays.
-        """
-        with self._refitting:
-            return self._movable().data.invalid
-
-    def _movable(self) -> TopLevel:
-        """Return the upper level with what moves need, which is made by the first move."""
-        if "rows" not in self._cache:
-            geometry: Any = self._snapshot.geometry
-            rows = self._cache["rows"] = rows_of(geometry, self._snapshot.attributes)
-            self._cache["all"] = upload(np.flatnonzero(rows >= 0), wp.int32, self.device)
-            self._top = self._top.movable(rows, geometry, part_boxes(geometry, self.bottoms, MOVED_BOXES))
-        return self._top
 
     @overload
     def move(self, instance: ArrayLike, matrix: ArrayLike | None = ..., rebuild_at: float = ..., *, check: bool = ...) -> Refit: ...
@@ -224,8 +284,8 @@ class Instances(InstanceArrays):
         begin = build_clock()
         if rebuild_at != np.inf:
             raise InputError("a move in place keeps the tree", argument="rebuild_at")
-        if not self._snapshot.changes:
-            self._begin_in_place()
+        if not isinstance(geometry := self._snapshot.geometry, MovedGeometry):
+            self._begin_in_place(cast(Any, geometry))
         top, (matrices, ids) = self._top, (*given, self._cache["all"])[:2]
         key = ids.shape, ids.strides, ids.dtype, matrices.ptr, matrices.dtype, matrices.shape, matrices.strides, matrices.device, ids.device
         known, transforms = self._cache.get("transforms", (None, None))
@@ -241,19 +301,6 @@ class Instances(InstanceArrays):
         top.place(ids, transforms)
         top.fit(ids)
         return Refit(build_clock() - begin, float("nan"), False)
-
-    def _begin_in_place(self) -> None:
-        """Give the structure arrays that no other snapshot shares."""
-        if self.device.is_capturing:
-            raise InputError("a graph cannot capture the first move in place, which allocates memory",
-                             hint="move in place once before the capture")
-        begin, before = build_clock(), self._snapshot
-        geometry: Any = before.geometry
-        self._top = self._movable().copied()
-        data = self._top.data
-        data.to_world = upload(geometry.to_world.reshape(-1, 4).copy(), wp.vec4d, self.device)
-        data.origin = wp.vec3d(*shift(geometry.origin)[:3, 3])
-        self._install_top(MovedGeometry(geometry, data.to_world), begin, before.built_cost, changes=True)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""

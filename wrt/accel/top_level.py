@@ -24,7 +24,6 @@ BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all in
 MOVED_BOXES = 64  # Boxes of a part in a move: fewer boxes take less time, and make the boxes of instances slightly larger.
 INSTANCES_PER_JOB = 1024
 WRITTEN = ("placements", "low", "high", "slack", "slot_slack", "node_slack", "nodes", "wide", "pending", "invalid")  # by a move
-LARGEST = 1e300
 NONE = -1
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
@@ -72,8 +71,17 @@ class TopLevel:
         """Write placements and boxes. ids: values of hits.instance; transforms: kernels.transforms.Transforms. Call `fit` afterwards."""
         launch(kernels.place, self.data, ids, transforms, threads=self.threads)
 
+    def follow(self, ids: WarpArray, part: int, tree: WarpStruct) -> None:
+        """Write the boxes of a refitted part and of its instances. ids: values of hits.instance; tree: of InPlaceBvh. Call `fit` then."""
+        step, to_world = -(-len(tree.order) // MOVED_BOXES), self.data.to_world
+        count = len(tree.low) if step <= 1 else -(-len(tree.order) // step)
+        launch_on(ids.device, kernels.measure, count, self.data, part, step, tree.order, tree.low, tree.high, captured=True)
+        transforms = transforms_of(wp.array(ptr=to_world.ptr, dtype=wp.float64, shape=4 * len(to_world), device=ids.device), 12, ids.device)
+        transforms.own = True
+        self.place(ids, transforms)
+
     def fit(self, ids: WarpArray) -> None:
-        """Fit the trees to the instances that `place` moved."""
+        """Fit the trees to the instances that `place` or `follow` changed."""
         launch(kernels.fit, self.data, ids, threads=self.threads)
 
 
@@ -149,8 +157,8 @@ def part_boxes(geometry: InstancedGeometry, bottoms: list[OneMesh], groups: int)
     out = []
     for part, bottom in zip(geometry.parts, bottoms, strict=True):
         order = bottom.built.order
-        low, high = (np.clip(corner, -LARGEST, LARGEST, dtype=np.float64) for corner in part.bounds())  # the box of all space is infinite
-        if len(low) > groups:
+        low, high = (np.clip(corner, -kernels.LARGEST, kernels.LARGEST, dtype=np.float64) for corner in part.bounds())
+        if len(order) > groups:
             first = np.arange(0, len(order), -(-len(order) // groups))
             low, high = np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
         out.append((0.5 * (low + high), 0.5 * (high - low)))

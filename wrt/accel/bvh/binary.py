@@ -103,7 +103,7 @@ class Bvh2(InPlaceBvh, BinaryBvh):
         fitting.refit(tree_of(fitting, nodes, built.parents, built.order), self._shape(), self.threads)
         return replace(built, arrays={"nodes": nodes}, sah_cost=fitting.root().sah_cost)
 
-    def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
+    def _in_place(self, built: Built, shape: WarpStruct) -> tuple[WarpStruct, Callable[[], None]]:
         fitting, data = Fitting(self.device, len(self.geometry), built.nodes), self.data
         tree = tree_of(fitting, data.nodes, parents_of(data.nodes), built.order)
 
@@ -111,7 +111,7 @@ class Bvh2(InPlaceBvh, BinaryBvh):
             fitting.refit(tree, shape, self.threads)
             self._write_corners(shape, tree.order, data.primitives)
 
-        return run
+        return tree, run
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
         """Return the triangle test's records.

@@ -26,8 +26,8 @@ class InPlaceBvh(OneMesh):
     """A BVH that can be refitted in place."""
 
     @abstractmethod
-    def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
-        """Return the function that fits self.data, the arrays of `built`, to the points of `shape`."""
+    def _in_place(self, built: Built, shape: WarpStruct) -> tuple[WarpStruct, Callable[[], None]]:
+        """Return a Tree of kernels.build, and the function that fits it and self.data, the arrays of `built`, to the points of `shape`."""
 
     def _shape(self) -> WarpStruct:
         """Upload the geometry. Its faces are cached on the device."""
@@ -68,7 +68,8 @@ class InPlaceBvh(OneMesh):
         moved = DeviceGeometry.unchecked(wp.clone(points), self._shape().faces, self.geometry.spheres)
         beside = self._over(self.geometry, built, before.built_cost)
         self._snapshot = replace(beside.snapshot, geometry=moved, followed=None, changes=True)
-        return self.data, moved.points, self._in_place(built, self._shape())
+        self.fitted, run = self._in_place(built, self._shape())
+        return self.data, moved.points, run
 
     def save(self, path: PathLike, mesh: bool = False) -> None:
         """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""

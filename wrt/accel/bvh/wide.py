@@ -229,7 +229,7 @@ class WideBvh(InPlaceBvh, CollapsedBvh):
         nodes = built.arrays["nodes"]
         return super()._upload(built if isinstance(nodes, wp.array) else replace(built, arrays={"nodes": aligned(nodes)}))
 
-    def _in_place(self, built: Built, shape: WarpStruct) -> Callable[[], None]:
+    def _in_place(self, built: Built, shape: WarpStruct) -> tuple[WarpStruct, Callable[[], None]]:
         host, data = built.on_host(), self.data
         references, starts, fitting = self._references(host), self._starts(host), Fitting(self.device, len(self.geometry), 0)
         tree = fit_inputs(references, built.order, starts, fitting)
@@ -245,7 +245,7 @@ class WideBvh(InPlaceBvh, CollapsedBvh):
                 launch_on(self.device, rows_kernel(), len(starts) - 1, shape, tree.order, tree.starts, self.width, data.primitives, None,
                           threads=self.threads, step=4 * ROWS_PER_JOB, captured=True)
 
-        return run
+        return tree, run
 
     def _check(self, built: Built) -> None:
         if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):

@@ -141,7 +141,7 @@ def _enclosing(snapshot: Snapshot, accel: Any) -> Accelerator | None:
         parts: list[Any] = [enclosing(bottom) for bottom in accel.bottoms]
         if all(new.snapshot is old.snapshot for new, old in zip(parts, accel.bottoms, strict=True)):
             return None
-        geometry = replace(geometry, parts=tuple(part.geometry for part in parts))
+        geometry = replace(geometry.now(), parts=tuple(part.geometry for part in parts))
         return type(accel).restore(parts, geometry, None, str(accel.device), accel.threads)
     if (found := enclosing_faces(geometry)) is None:
         return None

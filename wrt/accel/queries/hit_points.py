@@ -38,9 +38,12 @@ class DeviceScene(NamedTuple):
     surfaces: WarpStruct
     object_ids: WarpStruct
     rows: WarpArray | None = None  # Instance of each run of surfaces.instances; -1: none.
+    refitted: tuple[tuple[int, WarpArray], ...] = ()  # Index in surfaces.vertices and points of parts that are refitted in place.
 
     def follow(self, snapshot: Snapshot) -> None:
-        """Write the matrices of instances that moved in place."""
+        """Write the matrices of instances that moved in place, and the points of meshes that were refitted in place."""
+        for first, points in self.refitted:
+            wp.copy(self.surfaces.vertices, points, first)
         if isinstance(snapshot.geometry, MovedGeometry):
             from wrt.kernels.shade.hit_points import place_instances
 
@@ -285,7 +288,7 @@ def device_scene(snapshot: Snapshot) -> DeviceScene:
     if isinstance(geometry, DeviceGeometry) and geometry.points.device == device:
         surfaces.vertices = geometry.points  # which refits in place write
     else:
-        surfaces.vertices = upload(geometry.vertices if isinstance(geometry, Geometry) else scene.vertices, wp.vec3, device)
+        surfaces.vertices = upload(geometry.vertices if isinstance(geometry, Geometry) else scene.vertices.copy(), wp.vec3, device)
     surfaces.faces = upload(scene.faces, wp.vec3i, device)
     surfaces.normals = upload(np.zeros((1, 3)) if scene.normals is None else scene.normals, wp.vec3, device)
     surfaces.uvs = upload(scene.uvs, wp.vec2, device)
@@ -304,7 +307,9 @@ def device_scene(snapshot: Snapshot) -> DeviceScene:
     rows[run_of(placed, geometry)] = np.flatnonzero(geometry.is_placed)
     if scene.objects is None:
         object_ids.instance = upload(np.maximum(rows, 0), wp.int32, device)
-    return DeviceScene(scene, surfaces, object_ids, upload(rows, wp.int32, device))
+    begin = np.cumsum([0, *(part.n_vertices for part in geometry.parts)]).tolist()
+    refitted = tuple((at, part.points) for at, part in zip(begin, geometry.parts, strict=False) if isinstance(part, DeviceGeometry))
+    return DeviceScene(scene, surfaces, object_ids, upload(rows, wp.int32, device), refitted)
 
 
 def instance_records(placed: Placed) -> np.ndarray:
