@@ -227,7 +227,8 @@ def _query(snapshot: Snapshot, types: Mapping[str, np.dtype], rays: tuple[Any, A
     form, give = ((len(valid.origins),), None) if shape is None else (shape, to_tensor_like(*rays[:2]))
     arrays = answer_arrays(types, out, form, snapshot.device if valid.as_warp else None, give is not None)
     worlds = check_world(snapshot, form, **seen)
-    width = 0 if worlds is not None and form[:-1] == (len(worlds.arrays.root),) else tiled_width(form)  # a tile has rays of one world
+    of_worlds = worlds is not None and form[:-1] == (len(worlds.arrays.root),)  # a tile has rays of one world
+    width = 0 if shape is None or of_worlds else tiled_width(form)
     return Query(valid, arrays, threads, worlds, width), shape, give
 
 

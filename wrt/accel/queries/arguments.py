@@ -221,6 +221,8 @@ def check_world(snapshot: Snapshot, shape: Shape, world: ArrayLike | None = None
     """Check and convert the arguments `world`, `exclude` and `mask` of a query with rays of a shape. Return None for a query that needs
     none of them. Raises InputError that names the argument."""
     geometry, device = snapshot.geometry, snapshot.device
+    if world is None and exclude is None and mask is None and not over_worlds(geometry):  # the usual case
+        return None
     filters = _filters(snapshot, shape, exclude, mask)
     count = geometry.n_worlds if over_worlds(geometry) else 1
     if world is not None:
