@@ -137,15 +137,19 @@ class Worlds:
 
 
 @wp.func
-def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
-    """Load ray i and set first_prim to the root node of its world. If that world does not exist, the ray hits nothing."""
-    ray = load_ray(rays, i)
-    world = worlds.id[i]
-    if world >= 0 and world < worlds.root.shape[0]:
-        ray.first_prim = worlds.root[world]
+def in_world(ray: Ray, root: wp.array(dtype=wp.int32), world: int) -> Ray:
+    """Set first_prim to the root node of the world. If that world does not exist, the ray hits nothing."""
+    if world >= 0 and world < root.shape[0]:
+        ray.first_prim = root[world]
     else:
         ray.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
     return ray
+
+
+@wp.func
+def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
+    """Load ray i, in its world."""
+    return in_world(load_ray(rays, i), worlds.root, worlds.id[i])
 
 
 def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool, filtered: bool) -> Any:

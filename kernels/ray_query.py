@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.query import direction_scale, scaled_ray
+from wrt.kernels.query import direction_scale, in_world, scaled_ray
 from wrt.kernels.structs import Filter, Hit, Ray, Surfaces
 
 
@@ -164,10 +164,7 @@ def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
         out = traversal_ray(ray, world.kind != kind)
         out.origin = wp.vec3(wp.vec3d(ray.origin) - world.origin)
         if wp.static(instances):
-            if ray.world >= 0 and ray.world < world.roots.shape[0]:
-                out.first_prim = world.roots[ray.world]
-            else:
-                out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+            out = in_world(out, world.roots, ray.world)
         return out
 
     @wp.func

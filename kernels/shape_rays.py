@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from wrt.kernels.structs import kernel
+from wrt.kernels.structs import kernel, last_entry
 
 
 @wp.struct
@@ -95,14 +95,8 @@ def write_answers(shapes: Shapes, world: wp.array(dtype=wp.int32), found: Answer
     if out.shape.shape[0] > 0:
         out.shape[i] = -1
         if prim_id >= 0:
-            low = shapes.first_instance[world[i]]  # the last instance whose first face is not after the hit's
-            high = shapes.first_instance[world[i] + 1]
-            while high - low > 1:
-                middle = (low + high) / 2
-                after = shapes.first_prim[middle] > prim_id
-                low = wp.where(after, low, middle)
-                high = wp.where(after, middle, high)
-            out.shape[i] = shapes.shape[low]
+            begin = shapes.first_instance[world[i]]
+            out.shape[i] = shapes.shape[last_entry(shapes.first_prim, begin, shapes.first_instance[world[i] + 1], prim_id)]
     if out.distance.shape[0] > 0:
         out.distance[i] = wp.where(prim_id >= 0, found.distance[i], -1.0)
     if out.normal.shape[0] > 0:

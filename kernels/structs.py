@@ -94,6 +94,21 @@ def gamma(n: float) -> float:
 
 
 @wp.func
+def last_entry(first: wp.array(dtype=wp.int32), begin: int, end: int, prim_id: int) -> int:
+    """Return the last i of begin .. end - 1 with first[i] <= prim_id. Objects without primitives are skipped: their entry equals the next
+    entry."""
+    low = int(begin)
+    high = int(end)
+    while high - low > 1:
+        middle = (low + high) / 2
+        if first[middle] <= prim_id:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
 def largest(v: wp.vec3) -> float:
     """Return the largest absolute component."""
     return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))

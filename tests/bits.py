@@ -86,8 +86,10 @@ def moving_worlds(kind: str = "bvh8", order: str = "given", rebuilt: bool = Fals
             accel = wrt.build([scene] * 3, kind, threads=threads)
         if order == "twice":
             accel.move(ids, matrices[(step + 2) % 4])
-        moves: Any = wp.array(matrices[step], dtype=wp.float64, device=DEVICE) if order == "in place" else matrices[step]
-        accel.move(moves) if order == "in place" else accel.move(ids, moves[ids])
+        if order == "in place":
+            accel.move(wp.array(matrices[step], dtype=wp.float64, device=DEVICE))
+        else:
+            accel.move(ids, matrices[step][ids])
         hit = accel.closest_hit(origins, directions, world=np.arange(RAYS) % 3, threads=threads)
         assert (hit.prim_id >= 0).mean() > 0.3
         found += [hit.t, hit.object, hit.prim_id, hit.u, hit.v]

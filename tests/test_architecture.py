@@ -99,9 +99,9 @@ LONG_SIGNATURES = 7  # Functions with more than 7 parameters: public queries.
 AS_ELSEWHERE = {"multi_ray": 10}  # Parameters of functions that have those of another library's function.
 # Lines of each folder of wrt and kernels, with headers. A commit may lower an entry, or raise one and lower others by as much.
 MOST_LINES = {
-    "kernels": 1876, "kernels/build": 3457, "kernels/loops": 1761, "kernels/shade": 4312, "kernels/study": 655,
-    "kernels/traverse": 2050, "kernels/units": 815, "kernels/wide": 3852, "wrt": 366, "wrt/accel": 8699,
-    "wrt/cli": 1122, "wrt/compat": 1386, "wrt/core": 1895, "wrt/io": 3275, "wrt/lab": 7549, "wrt/picture": 1137,
+    "kernels": 1886, "kernels/build": 3457, "kernels/loops": 1761, "kernels/shade": 4291, "kernels/study": 655,
+    "kernels/traverse": 2050, "kernels/units": 815, "kernels/wide": 3852, "wrt": 366, "wrt/accel": 8704,
+    "wrt/cli": 1122, "wrt/compat": 1392, "wrt/core": 1895, "wrt/io": 3275, "wrt/lab": 7547, "wrt/picture": 1137,
     "wrt/renderer": 3450, "wrt/scene": 2482, "wrt/sensors": 966, "wrt/viewer": 1298,
 }
 

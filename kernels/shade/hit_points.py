@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays, Worlds, load_hit
 from wrt.kernels.shade.surface import Place, corners_at, instance_at, make_triangle_at, sphere_uv, triangle_point, triangle_uv
-from wrt.kernels.structs import Hit, Instance, Surfaces, kernel
+from wrt.kernels.structs import Hit, Instance, Surfaces, kernel, last_entry
 from wrt.kernels.transforms import inverted
 
 U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoff of float32.
@@ -205,20 +205,6 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 
 @wp.func
-def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
-    """Return the last i with first[i] <= prim_id. Objects without primitives are skipped: their entry equals the next entry."""
-    low = int(0)
-    high = int(first.shape[0])
-    while high - low > 1:
-        middle = (low + high) / 2
-        if first[middle] <= prim_id:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-@wp.func
 def place_of(surfaces: Surfaces, prim_id: int) -> Place:
     """Return the indices of a primitive's data. An index of an instance or material that does not exist is -1."""
     place = Place()
@@ -260,7 +246,7 @@ def write_miss(out: HitPlaces, i: int):
 @wp.func
 def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, world: int, prim_id: int, out: HitPlaces, i: int):
     if out.face.shape[0] + out.object.shape[0] + out.instance.shape[0] > 0:
-        index = last_entry(object_ids.first_prim, prim_id)
+        index = last_entry(object_ids.first_prim, 0, object_ids.first_prim.shape[0], prim_id)
         write(out.face, i, wp.where(prim_id < surfaces.n_triangles, prim_id - object_ids.first_prim[index], -1))
         if out.instance.shape[0] > 0:
             out.instance[i] = index

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, WorldRays, Worlds, direction_scale, load_hit, scaled_ray
+from wrt.kernels.query import HitArrays, WorldRays, Worlds, direction_scale, in_world, load_hit, scaled_ray
 from wrt.kernels.shade.hit_points import HitPlaces, ObjectIds, ids_of, points_of, write, write_places
 from wrt.kernels.structs import Hit, Surfaces, kernel, query_kernel
 from wrt.kernels.transforms import Affine, Transforms, affine_of, times
@@ -92,7 +92,9 @@ def pixel_of(sensors: Sensors, i: int) -> Pixel:
 
 @wp.func
 def pixel_after(sensors: Sensors, at: Pixel, i: int) -> Pixel:
-    """Return the pixel of ray i of the same square, where `at` is that of ray i - 1: `pixel_of` without its divisions."""
+    """Return the pixel of ray i, where `at` is that of ray i - 1: within a square without the divisions of `pixel_of`."""
+    if i % SQUARE == 0:
+        return pixel_of(sensors, i)
     out = at
     out.column += 1
     if sensors.tiled:
@@ -166,13 +168,10 @@ def show(axis: int, i: int, view: View, direction: wp.vec3, hit: Hit, images: Im
 def make_rays(sensors: Sensors, rays: WorldRays, first: int, end: int):
     """Make the rays first .. end - 1 in rays[0 .. end - first - 1]; `first` is a multiple of SQUARE."""
     begin = first + RAYS * wp.tid()
-    at = Pixel()
-    view = view_of(sensors, pixel_of(sensors, begin))
+    at = pixel_of(sensors, begin)
+    view = view_of(sensors, at)
     for i in range(begin, wp.min(begin + RAYS, end)):
-        if i % SQUARE == 0:
-            at = pixel_of(sensors, i)
-        else:
-            at = pixel_after(sensors, at, i)
+        at = pixel_after(sensors, at, i)
         if other_view(sensors, at, view):
             view = view_of(sensors, at)
         j = i - first
@@ -188,14 +187,11 @@ def show_hits(surfaces: Surfaces, object_ids: ObjectIds, sensors: Sensors, image
               end: int):
     """Write the pixels of the rays first .. end - 1, from rays and hits[0 .. end - first - 1]."""
     begin = first + RAYS * wp.tid()
-    at = Pixel()
-    view = view_of(sensors, pixel_of(sensors, begin))
+    at = pixel_of(sensors, begin)
+    view = view_of(sensors, at)
     places = ids_of(images.places) + points_of(images.places) > 0  # write_places is large: a call takes long
     for i in range(begin, wp.min(begin + RAYS, end)):
-        if i % SQUARE == 0:
-            at = pixel_of(sensors, i)
-        else:
-            at = pixel_after(sensors, at, i)
+        at = pixel_after(sensors, at, i)
         if other_view(sensors, at, view):
             view = view_of(sensors, at)
         hit = load_hit(hits, i - first)
@@ -214,10 +210,7 @@ def make_sensor_kernel(accel_struct: Any, traverse: Any) -> Any:
         direction = direction_of(sensors, at, view)
         ray = scaled_ray(view.origin, direction, 0.0, sensors.t_max)
         if sensors.worlds.root.shape[0] > 0:
-            if view.world >= 0 and view.world < sensors.worlds.root.shape[0]:
-                ray.first_prim = sensors.worlds.root[view.world]
-            else:
-                ray.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+            ray = in_world(ray, sensors.worlds.root, view.world)
         hit = traverse(accel, surfaces, ray)
         hit.t = hit.t * direction_scale(direction)
         show(sensors.axis, at.index, view, direction, hit, images)

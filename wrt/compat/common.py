@@ -15,6 +15,7 @@ from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.rays import Rays
 from wrt.accel.scenes.build import build
+from wrt.core.errors import warn
 from wrt.scene import shapes
 from wrt.scene.clean import flip_collinear
 from wrt.scene.mesh import Mesh, unit_rows
@@ -52,6 +53,24 @@ def hit_counts(accel: Accelerator, rays: Rays, threads: int) -> np.ndarray:
 def _touched(accel: Accelerator, rays: Rays, threads: int) -> Hits[np.ndarray]:
     """Return the hits of rays that only touch faces, (N, 1) or (N, 2)."""
     return first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, *rays, threads=threads)
+
+
+def mesh_of(kind: str, size: np.ndarray, segments: int) -> Mesh | None:
+    """Return the mesh of a simulator's shape without data: an upper-case name and half sizes. None for other kinds.
+
+    A plane with a size of 0 is endless: 10 km to each side."""
+    if kind == "PLANE":
+        x, y = np.where(size[:2] > 0.0, size[:2], 1e4)
+        return shapes.quad((-x, -y, 0.0), (2.0 * x, 0.0, 0.0), (0.0, 2.0 * y, 0.0))
+    if kind == "BOX":
+        return shapes.box(-size, size)
+    return turned(kind, size, segments) if kind in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "CONE") else None
+
+
+def warn_of(left: list[str]) -> None:
+    """Warn of what a simulator's model has and a structure has not."""
+    if left:
+        warn(f"rays miss what cannot be traced: {', '.join(left[:5])}{f' and {len(left) - 5} more' if len(left) > 5 else ''}")
 
 
 def turned(kind: str, size: np.ndarray, segments: int) -> Mesh:

@@ -9,10 +9,10 @@ import warp as wp
 
 from wrt.accel.queries.rays import filled
 from wrt.accel.scenes.build import build
-from wrt.compat.common import turned
+from wrt.compat.common import mesh_of, warn_of
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, start, upload
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import InputError
 from wrt.core.settings import DEFAULT_DEVICE
 from wrt.core.threads import thread_count
 from wrt.kernels.shape_rays import Answers, GeomRays, Shapes, place_geoms, spread_rays, write_answers
@@ -89,18 +89,13 @@ def _field(model: mujoco.MjModel, index: int) -> Mesh:
 
 def _mesh_of(model: mujoco.MjModel, geom: int) -> Mesh | None:
     """Return the mesh of a geom, in its own space, or None if it cannot be traced."""
-    kind, size, data = dict(enumerate(KINDS)).get(int(model.geom_type[geom])), model.geom_size[geom], int(model.geom_dataid[geom])
-    if kind == "PLANE":
-        x, y = np.where(size[:2] > 0.0, size[:2], 1e4)  # 0: endless
-        return shapes.quad((-x, -y, 0.0), (2.0 * x, 0.0, 0.0), (0.0, 2.0 * y, 0.0))
-    if kind == "BOX":
-        return shapes.box(-size, size)
+    kind, size, data = dict(enumerate(KINDS)).get(int(model.geom_type[geom]), ""), model.geom_size[geom], int(model.geom_dataid[geom])
     if kind == "HFIELD":
         return _field(model, data)
     if kind == "MESH":
         return Mesh(model.mesh_vert[model.mesh_vertadr[data]:][: model.mesh_vertnum[data]],
                     model.mesh_face[model.mesh_faceadr[data]:][: model.mesh_facenum[data]])
-    return kind and turned(kind, size if kind == "ELLIPSOID" else size * [1.0, 1.0, 0.0], SEGMENTS)  # type: ignore[return-value]
+    return mesh_of(kind, size * [1.0, 1.0, 0.0] if kind in ("CAPSULE", "CYLINDER") else size, SEGMENTS)
 
 
 def _meshes(model: mujoco.MjModel) -> dict[int, Mesh]:
@@ -116,8 +111,7 @@ def _meshes(model: mujoco.MjModel) -> dict[int, Mesh]:
             left.append(f"geom {geom} {model.geom(geom).name!r}")
         else:
             out[geom] = mesh
-    if left:
-        warn(f"rays miss what cannot be traced: {', '.join(left[:5])}{f' and {len(left) - 5} more' if len(left) > 5 else ''}")
+    warn_of(left)
     if not out:
         raise InputError("has no geom that can be traced", argument="model")
     return out

@@ -11,15 +11,14 @@ import warp as wp
 
 from wrt.accel.queries.rays import filled
 from wrt.accel.scenes.build import build
-from wrt.compat.common import turned
+from wrt.compat.common import mesh_of, warn_of
 from wrt.core.arrays import to_numpy
 from wrt.core.checks import as_integer, shown
 from wrt.core.device import launch_on, upload
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.io.gltf.meshes import compose
 from wrt.kernels.shape_rays import Answers, Shapes, known_worlds, place_shapes, write_answers
-from wrt.scene import shapes
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
@@ -70,15 +69,10 @@ def from_newton(model: newton.Model, *, shape_flags: int = 1, segments: int = 12
 
 def _mesh_of(kind: str, size: np.ndarray, source: Any, segments: int) -> Mesh | None:
     """Return the mesh of a shape with a kind of newton.GeoType, or None if it cannot be traced."""
-    if kind == "PLANE":
-        x, y = np.where(size[:2] > 0.0, 0.5 * size[:2], 1e4)  # 0: endless
-        return shapes.quad((-x, -y, 0.0), (2.0 * x, 0.0, 0.0), (0.0, 2.0 * y, 0.0))
-    if kind == "BOX":
-        return shapes.box(-size, size)
     if kind in ("MESH", "CONVEX_MESH", "HFIELD") and source is not None:
         vertices, faces = to_numpy(source.points if kind == "HFIELD" else source.vertices), to_numpy(source.indices).reshape(-1, 3)
         return Mesh(vertices * size, faces[:, ::-1] if np.prod(size) < 0.0 else faces)  # the outside stays outside
-    return turned(kind, size, segments) if kind in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "CONE") else None
+    return mesh_of(kind, 0.5 * size if kind == "PLANE" else size, segments)
 
 
 def _meshes(model: newton.Model, chosen: list[int], segments: int) -> dict[int, Mesh]:
@@ -98,14 +92,13 @@ def _meshes(model: newton.Model, chosen: list[int], segments: int) -> dict[int, 
         left += [f"shape {shape} {model.shape_label[shape]!r} ({kind})"] if known[shape] is None else []
     for name, what in (("particle_count", "particles"), ("tri_count", "deformable triangles")):
         left += [f"{count} {what}"] if (count := getattr(model, name, 0)) else []
-    if left:
-        warn(f"rays miss what cannot be traced: {', '.join(left[:5])}{f' and {len(left) - 5} more' if len(left) > 5 else ''}")
+    warn_of(left)
     return {shape: mesh for shape in chosen if (mesh := known[shape]) is not None}
 
 
 class ModelScene:
-    """The shapes of a Newton Model, made by `from_newton`. `accel` is the structure over its worlds, and a last one of the shapes that all
-    worlds share (world -1). `shape`, (I,) int32, is the index of the model's shape for each value of `hits.instance`."""
+    """The shapes of a Newton Model, made by `from_newton`. `accel` is the structure over its worlds; a last world has the shapes of world
+    -1, which all worlds share. `shape`, (I,) int32, is the index of the model's shape for each value of `hits.instance`."""
 
     def __init__(self, model: newton.Model, meshes: dict[int, Mesh], options: dict[str, Any]) -> None:
         self.model, self.device = model, model.device
@@ -144,7 +137,7 @@ class ModelScene:
         self.accel.move(self._poses)
 
     def _checked(self, shape: tuple[int, ...], kinds: dict[str, Any], given: dict[str, Any]) -> list[WarpArray | None]:
-        """Return the given arrays in the order of `kinds`, the types by name; None for those that are not given.
+        """Return the given arrays in the order of `kinds`, the types by name, with None for each missing one.
         Raises InputError for other names, and for what is no contiguous Warp array of this type and shape on the device."""
         for name, array in given.items():
             if name not in kinds:

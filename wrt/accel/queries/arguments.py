@@ -227,7 +227,7 @@ def check_world(snapshot: Snapshot, shape: Shape, world: ArrayLike | None = None
     count = geometry.n_worlds if over_worlds(geometry) else 1
     if world is not None:
         if not over_worlds(geometry):
-            raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
+            raise no_worlds()
         ids = _on_device(indices_of(world, shape, "world", 0, count), device)
     elif count > 1 and shape[:1] != (count,):
         raise InputError(f"must not be None: the structure is over {count} worlds, because wrt.build makes a world of each entry of a list,"
@@ -289,6 +289,11 @@ def roots_at(snapshot: Snapshot, worlds: WorldIds | None, n: int) -> np.ndarray 
         return np.full(n, roots[0], np.int32)
     ids = worlds.arrays.id.numpy()
     return np.asarray(roots[np.where((ids >= 0) & (ids < len(roots) - 1), ids, -1)])
+
+
+def no_worlds() -> InputError:
+    """Return the error for an argument `world` where there are no worlds."""
+    return InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
 
 
 def over_worlds(geometry: object) -> TypeGuard[InstancedGeometry]:

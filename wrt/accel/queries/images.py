@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, present
-from wrt.accel.queries.arguments import over_worlds
+from wrt.accel.queries.arguments import no_worlds, over_worlds
 from wrt.accel.queries.batches import BUFFERED, MOST_PACKED, RAYS_PER_LAUNCH, Tracer, has_stream, new_scratch, tracer, world_tracer
 from wrt.accel.queries.hit_points import device_scene, require
 from wrt.accel.queries.raw_launches import SMALL, launch_raw
@@ -104,7 +104,7 @@ def set_worlds(snapshot: Snapshot, sensors: Any, world: ArrayLike | None, images
     geometry = snapshot.geometry
     if not over_worlds(geometry):
         if world is not None:
-            raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
+            raise no_worlds()
         return False
     given = from_tensor(world, "world", wp.int32) if world is not None else None
     if given is None:

@@ -1,7 +1,7 @@
 """Hard cases for simulators: rays among moved bodies in several worlds. The oracle judges each ray against the bodies that it may see.
 
-Poses are exact in float32, as matrices and as quaternions: one of the twelve rotations of a tetrahedron, perhaps mirrored, with a
-translation by multiples of 2^-6; corners are multiples of 2^-14. So the vertices of a placed body are float32 numbers, and the oracle's
+Poses are exact in float32, as matrices and as quaternions: each is one of the twelve rotations of a tetrahedron, perhaps mirrored, and a
+translation by multiples of 2^-6. Corners are multiples of 2^-14. So the vertices of a placed body are float32 numbers, and the oracle's
 geometry has no error. All bodies are closed, so that rays that leak through an edge are seen."""
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
 from wrt.core.checks import as_integer, as_tuple, require_known
+from wrt.io.gltf.meshes import compose
 from wrt.lab.hard_cases.common import UNKNOWN, HardCase, cube, hard_case, joined, sphere, surface, targets
 from wrt.lab.hard_cases.conformance import Report, Result, checked
 from wrt.lab.hard_cases.judge import Verdict, judge
@@ -53,11 +54,8 @@ class Bodies:
     @property
     def to_world(self) -> np.ndarray:
         """The poses after the move, (B, 3, 4) float64."""
-        x, y, z, w = self.quaternion.T
-        rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]).transpose(2, 0, 1)
-        return np.concatenate([np.where(self.mirrored, -1.0, 1.0)[:, None, None] * rotation, self.position[:, :, None]], axis=2)
+        signs = np.where(self.mirrored, -1.0, 1.0)[:, None]
+        return compose(self.position, self.quaternion, np.tile(signs, 3))[:, :3]
 
     def placed(self, body: int) -> Geometry:
         """Return a body's mesh in its world."""
@@ -183,8 +181,8 @@ def result(name: str, closest_body: ClosestBody, rays: int = 1000, seed: int = 0
 
 
 def _faces(case: HardCase, t: np.ndarray, part: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a face of the reported part that the ray meets, or touches within rounding, at t, (N,): -1 for a miss, the number of faces
-    if there is none. Also return the exact t, (N,): inf if the ray meets no face of the part there."""
+    """Return a face of the reported part that the ray meets, or touches within rounding, at t, (N,). It is -1 for a miss, and the number of
+    faces where the ray meets none. Also return the exact t, (N,): inf if the ray meets no face of the part there."""
     reference, found = reference_of(case.geometry), np.where(part >= 0, first[-1], -1)
     every = reference.all_hits(case.origins, case.directions)
     own = every[(part[every.ray] >= 0) & (np.searchsorted(first, every.prim_id, "right") - 1 == part[every.ray])]
