@@ -139,7 +139,7 @@ class Filter:
     """Instances that a ray does not see (Units.filtered)."""
 
     exclude: int  # Value of Instances.bodies that the ray passes through; -1: none.
-    mask: int  # Bits, of which an instance that the ray sees has at least one in Instances.masks.
+    mask: int  # Bits: the ray sees an instance that has at least one of them in Instances.masks.
 
 
 @wp.func

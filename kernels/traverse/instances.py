@@ -41,7 +41,7 @@ def make_struct(bottom: Any) -> Any:
         bottoms: wp.array(dtype=bottom)
         ids: wp.array(dtype=wp.int32)  # Value of hits.instance of each placement.
         bodies: wp.array(dtype=wp.int32)  # By the value of hits.instance: a number that a ray can exclude.
-        masks: wp.array(dtype=wp.int32)  # By the value of hits.instance: bits of which a ray must share one.
+        masks: wp.array(dtype=wp.int32)  # By the value of hits.instance: 32 bits; a ray that shares none does not see the instance.
         bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).
         slack: wp.array(dtype=float)  # For the root of each tree in `nodes`: factor by which `enter` widens boxes.
         recorder: Recorder
